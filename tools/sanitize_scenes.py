@@ -60,8 +60,8 @@ WAYS = {
         Way(cones(1), {"_CLUSTER_EACH": 10}),
         Way(cones(2), {"_CLUSTER_EACH": 40}),
     ),
-    "grid": (Way(BAR, {"_GRID_TETS": 8}),),
-    "far": (Way(bar(99, 1, 1), {"_GRID_TETS": 594}),),
+    "grid": (Way(BAR, {"_MIN_GRID_TETS": 8}),),
+    "far": (Way(bar(99, 1, 1), {"_MIN_GRID_TETS": 594}),),
     "stream": (
         Way(BAR, {"_STREAM_TETS": SMALL}),
         Way(crumbs(9), {"_STREAM_TETS": SMALL}),  # more parts of pieces than a block has warps that move them

@@ -106,7 +106,7 @@ def measure(name: str, scene_name: str, tets: int | None, plans: Path) -> None:
     from torchpd.plan import kernel_choice as regimes
 
     if tets is not None:
-        regimes._STREAM_TETS, regimes._PIPED_MORE = dict.fromkeys(regimes._STREAM_TETS, tets), 1.0
+        regimes._STREAM_TETS, regimes._PIPELINE_GROWTH = dict.fromkeys(regimes._STREAM_TETS, tets), 1.0
     scene = next(scene for scene in GPU_SCENES if scene.name == scene_name)
     kept = plans / f"{scene_name}-{tets}.pickle"
     if kept.exists():

@@ -70,7 +70,7 @@ def test_gpu_without_cuda_build_is_a_problem(built: None, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("capabilities", "said"),
     [
-        ([], "torch sees no CUDA device: look at the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES"),
+        ([], "torch sees no CUDA device: check the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES"),
         ([(7, 5)], "compute capability 7.5 and the kernels need 8.0 or newer"),
         ([(7, 5), (9, 0)], ""),
     ],

@@ -303,7 +303,7 @@ def test_iterates_of_large_patches(name: str, solver: str, precision: str) -> No
 
 def test_iterates_of_patches_with_many_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thread has five pairs of tetrahedra and more; in float64 no such patch fits the shared memory of a block."""
-    monkeypatch.setattr(regimes, "_GRID_TETS", 4000)
+    monkeypatch.setattr(regimes, "_MIN_GRID_TETS", 4000)
     case = bar((30, 10, 10), pd.Gravity())
     sim = simulator(case, torch.float32, GPU, kernel="grid", iterations=12)
     assert (sim.plan.patch_pairs > 5 * 384).all()

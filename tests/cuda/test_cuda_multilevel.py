@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 import torchpd as pd
 from torchpd.common.tables import MULTILEVEL_TABLE
 from torchpd.plan import preconditioner as multilevel
-from torchpd.plan.preconditioner import precondition_plan, reference_of_levels
+from torchpd.plan.preconditioner import precondition_plan, stored_reference
 
 require_gpu()
 
@@ -84,7 +84,7 @@ def share(gpu: pd.Simulator, cpu: pd.Simulator) -> None:
     """Gives a simulator on the CPU the preconditioner of one on a GPU; rows of a direct one are its own."""
     place = np.argsort(cpu.plan.vertex_order.numpy())[gpu.plan.vertex_order.cpu().numpy()]
     if gpu.plan.level_sizes[6]:
-        reference = (array.cpu() for array in reference_of_levels(gpu.plan.arrays))
+        reference = (array.cpu() for array in stored_reference(gpu.plan.arrays))
         cpu.plan = precondition_plan(cpu.plan, cpu.scene.values(), *reference, most_direct=multilevel.MOST_DIRECT)
         weight = gpu.plan.turning_weight.cpu().numpy()
         arrays = {"turning_weight": np.empty_like(weight)}
@@ -274,7 +274,7 @@ def test_solvers_can_be_exchanged() -> None:
     sim, start = small(torch.float64, GPU)
     plain = sim(start)
     sim.solver = pd.Multilevel()
-    assert sim.plan.for_levels
+    assert sim.plan.for_multilevel
     text = str(sim)
     assert "preconditioner: " in text
     assert "all iterations in one launch" in text
@@ -286,7 +286,7 @@ def test_solvers_can_be_exchanged() -> None:
     sim.prepare_solver()
     assert same_bits(sim(start), first)
     sim.solver = pd.Chebyshev()
-    assert not sim.plan.for_levels
+    assert not sim.plan.for_multilevel
     assert same_bits(sim(start), plain)
     sim_with_levels, _ = small(torch.float64, GPU, solver=pd.Multilevel())
     block, _ = small(torch.float64, GPU, kernel="block")

@@ -423,7 +423,7 @@ def test_benchmark_times_every_kernel_once_and_steps_with_the_quickest(monkeypat
     (times,) = kernel_benchmark._TIMES.values()
     assert times.keys() >= {"block", "grid", "stream"}
     assert sim.plan.kernel == min(times, key=lambda kernel: times[kernel])
-    assert "the quickest of those timed" in repr(sim)
+    assert "the fastest kernel, milliseconds per step" in repr(sim)
     asked = simulator(case, torch.float32, GPU, kernel=str(sim.plan.kernel), batch=4)
     state = sim.rest_state(batch=4)
     assert torch.equal(sim(state).positions, asked(state).positions)

@@ -219,7 +219,7 @@ def test_a_launch_that_the_device_refuses_changes_nothing(
         patch.setattr(placing, "properties_of", lambda device: other)
         patch.setattr(placing, "step_bytes", lambda *_: 0)  # asks the device, which would refuse the simulator
         patch.setitem(regimes._STREAM_TETS, dtype, 10**6)
-        patch.setattr(regimes, "_LEVEL_ALONE", 10**6)
+        patch.setattr(regimes, "_MAX_BLOCK_TETS", 10**6)
         sim = simulator(case, dtype, GPU, iterations=2, **settings_of(runner))
     state = state_of(case, sim)
     own = state.clone()

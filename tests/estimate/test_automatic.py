@@ -156,7 +156,7 @@ def test_what_lands_reaches_the_aim(youngs: float, friction: float, chosen: type
     case = landing(youngs, friction=friction)
     sim = pd.Simulator(case.scene, case.time_step, solver="auto", dtype=torch.float64, progress=False)
     assert isinstance(sim.solver, chosen)
-    assert ("friction may keep Multilevel from working" in repr(sim)) == (friction > 0.0)
+    assert ("friction may stall Multilevel" in repr(sim)) == (friction > 0.0)
     exact = pd.Simulator(case.scene, case.time_step, 60000, dtype=torch.float64, tolerance=1e-9, progress=False)
     state, errors = state_of(case, sim), []
     for _ in range(4):
@@ -291,7 +291,7 @@ def test_the_batch_decides_where_environments_share_a_device(monkeypatch: pytest
 def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a GPU a simulator with Multilevel has a plan of other patches, whose costs are not Chebyshev's."""
     sim = beam(1e6)
-    sim.plan = dataclasses.replace(sim.plan, for_levels=True)
+    sim.plan = dataclasses.replace(sim.plan, for_multilevel=True)
     solvers = []
 
     def fails(compiled: CompiledScene, *_: object) -> None:
@@ -305,7 +305,7 @@ def test_the_kernel_of_chebyshev_is_compared_whatever_ran_before(monkeypatch: py
         assert isinstance(solvers.pop(), pd.Chebyshev)
         # all or nothing
         assert isinstance(sim.solver, pd.Multilevel)
-        assert sim.plan.for_levels
+        assert sim.plan.for_multilevel
 
 
 @pytest.mark.parametrize("youngs", [1e3, 1e4, 1e5, 1e6])
@@ -397,7 +397,7 @@ def test_a_sheet_that_buckles_over_a_ball_gets_chebyshev() -> None:
     scene = pd.Scene(pd.Solid(mesh, 1e5, 300.0), *parts)
     sim = pd.Simulator(scene, 1 / 60, solver="auto", progress=False, dtype=torch.float64)
     assert isinstance(sim.solver, pd.Chebyshev)
-    assert "a ball may keep Multilevel from working" in str(sim)
+    assert "a ball may stall Multilevel" in str(sim)
     state = sim.rollout(sim.rest_state(), 13).state()
     converged = pd.Simulator(scene, 1 / 60, 4000, progress=False, dtype=torch.float64)(state).positions
     error = (sim(state).positions - converged).norm()
@@ -432,7 +432,7 @@ def test_a_choice_that_is_not_capped_warns_when_it_has_become_too_few(tmp_path: 
     body = pd.Solid(pd.shapes.box((0.05, 0.01, 0.01), (5, 1, 1)), 1e9, 7800.0)
     sim = pd.Simulator(pd.Scene(body, pd.Gravity(), pd.Ground(-0.05)), solver="auto", tolerance=1e-3)
     assert MOST_OF_LEVELS < sim.iterations < PATIENCE * MOST_OF_LEVELS
-    with pytest.warns(pd.UnsolvedWarning, match=r"prepare_solver\(\) chooses anew"):
+    with pytest.warns(pd.UnsolvedWarning, match=r"prepare_solver\(\) chooses again"):
         sim.set_material(stiffness=1e6 * sim.stiffness)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -68,7 +68,10 @@ def test_a_change_that_leaves_the_default_far_too_few_is_said_once(owner: str) -
     expected = forecast(sim.compiled)
     assert expected is not None
     assert expected.error(64) > 0.1
-    assert f"{owner.strip()}: 64 iterations now leave an error of about {expected.error(64):.1g} of a step" in message
+    assert (
+        f"{owner.strip()}: 64 iterations now leave a relative error of about {expected.error(64):.1g} per step"
+        in message
+    )
     assert f'{expected.words(1e-2)} reach 1e-2. Set sim.iterations, or take solver="auto", or ask' in message
     assert said(lambda: sim.set_material(stiffness=1e8)) == []
 
@@ -77,8 +80,8 @@ def test_a_change_that_leaves_the_default_far_too_few_is_said_once(owner: str) -
 def test_auto_says_that_it_would_choose_anew(owner: str) -> None:
     sim = beam(solver="auto")
     (message,) = said(lambda: CHANGES[owner](sim))
-    assert f'{sim.iterations} iterations that "auto" chose before now leave an error of about' in message
-    assert message.endswith("sim.prepare_solver() chooses anew")
+    assert f'{sim.iterations} iterations that "auto" chose before now leave a relative error of about' in message
+    assert message.endswith("sim.prepare_solver() chooses again")
     # which makes it right, and worth a warning again
     sim.prepare_solver()
     expected = forecast(sim.compiled)
@@ -101,7 +104,7 @@ def test_shorter_steps_overshoot_with_the_relaxation_of_auto() -> None:
     left = (sim.solver.settings()["relaxation"] - 1.0) ** sim.iterations
     assert left > 1e-2
     (message,) = said(lambda: setattr(sim, "time_step", 1e-6))
-    assert f"an error of about {left:.1g} of a step" in message
+    assert f"a relative error of about {left:.1g} per step" in message
 
 
 @pytest.mark.parametrize("solver", [None, "auto"])

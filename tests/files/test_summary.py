@@ -128,8 +128,8 @@ def test_print_says_how_a_gpu_would_step(kernel: str, facts: tuple[str, ...], mo
         assert fact in text, fact
     assert "SIMD" not in text
     sim.plan = choose_plan(values, torch.float32, Properties(132, 232_448))
-    assert "why block: shared memory a thread block: block needs" in str(sim)
-    assert "232,448 B are there" in str(sim)
+    assert "why block: shared memory per thread block: block needs" in str(sim)
+    assert "232,448 B are available" in str(sim)
     for kernel, depends in (("auto", True), ("block", True), ("grid", True), ("cluster", False), ("stream", False)):
         told = simulator(bare(pd.Ground()), torch.float32, batch=7, kernel=kernel)
         told.plan = sim.plan

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import spsolve
 from small_strains import elastic_matrix
 
 import torchpd as pd
-from torchpd.geometry.occupancy import LEAST_FILL, parts_of
+from torchpd.geometry.occupancy import MIN_FILL, parts_of
 
 Array = NDArray[np.float64]
 
@@ -56,7 +56,7 @@ def filled(mesh: pd.TetMesh) -> float:
 @pytest.mark.parametrize(
     ("surface", "cells", "tolerance"),
     [
-        # Tets that are hardly touched count LEAST_FILL: a layer of some tenths of a cell, times 0.05, is too much.
+        # Tets that are hardly touched count MIN_FILL: a layer of some tenths of a cell, times 0.05, is too much.
         (ball(), 5, 0.02),
         (ball(), 12, 0.01),
         (ball(4), 20, 0.005),
@@ -100,8 +100,8 @@ def test_each_tet_has_the_share_that_samples_say() -> None:
     points = np.einsum("sa,eak->esk", weights, mesh.vertices[mesh.tets]) / [1.0, 0.7, 0.8]
     inside = (np.linalg.norm(points, axis=2) < 1.0).mean(axis=1)
     # 4000 samples are right to 0.03 (four deviations); 18 little cubes with a face right in each, to a tenth or so.
-    assert np.abs(fill_of(mesh) - np.maximum(inside, LEAST_FILL)).max() < 0.13
-    assert np.abs(fill_of(mesh) - np.maximum(inside, LEAST_FILL)).mean() < 0.02
+    assert np.abs(fill_of(mesh) - np.maximum(inside, MIN_FILL)).max() < 0.13
+    assert np.abs(fill_of(mesh) - np.maximum(inside, MIN_FILL)).mean() < 0.02
 
 
 # What is inside:
@@ -262,7 +262,7 @@ def test_what_encloses_nothing_is_a_body_of_full_tets(both_sides: bool) -> None:
 
 def test_a_plate_thinner_than_the_grid_keeps_the_least_share() -> None:
     mesh = pd.tetrahedralize(block(1.0, 1.0, 0.002), cells=10)  # 0.02 cells
-    assert LEAST_FILL <= fill_of(mesh).min() <= fill_of(mesh).max() < 0.1
+    assert MIN_FILL <= fill_of(mesh).min() <= fill_of(mesh).max() < 0.1
 
 
 # What becomes of it:

@@ -20,7 +20,7 @@ import torchpd as pd
 from torchpd import MeshWarning, TetMesh, TriMesh
 from torchpd.geometry import shapes
 from torchpd.geometry.embedding import embed_triangles
-from torchpd.geometry.mesh_faces import TET_FACES, count_pieces, merge_near, sort_faces
+from torchpd.geometry.mesh_faces import TET_FACES, count_components, merge_near, sort_faces
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -180,7 +180,7 @@ def test_loose_tets_are_counted_and_merged(scale: float, noise: float) -> None:
     vertices, tets = loose(BOX)
     vertices = scale * (vertices + noise * np.random.default_rng(0).uniform(-1.0, 1.0, vertices.shape))
     message = told(vertices, tets)
-    assert "144 of 192 outer faces lie on one another" in message
+    assert "144 of 192 outer faces coincide" in message
     assert "in 48 pieces" in message
     assert message.endswith("which leaves 1")
     assert "mesh.merged()" in message
@@ -228,7 +228,9 @@ def test_a_mesh_that_is_there_twice() -> None:
         warnings.simplefilter("ignore")
         twice = TetMesh(*beside(BOX, BOX))
     twice = twice.with_embedding(embed_triangles(twice.vertices, twice.tets, twice.boundary()[:48]))
-    with pytest.raises(ValueError, match=r"every tet must come once.* \(48 in all\); pass drop_degenerate=True"):
+    with pytest.raises(
+        ValueError, match=r"TetMesh.tets: tets must be distinct.* \(48 in all\); pass drop_degenerate=True"
+    ):
         twice.merged()
     with pytest.warns(MeshWarning, match="48 of 96 tets come twice"):
         once = twice.merged(drop_degenerate=True)
@@ -342,7 +344,7 @@ def test_moving_a_mesh_says_nothing_again() -> None:
 
 
 def test_pieces_hang_together_by_vertices() -> None:
-    assert count_pieces(np.array([[0, 1, 2, 3], [3, 4, 5, 6], [9, 10, 11, 12]])) == 2
+    assert count_components(np.array([[0, 1, 2, 3], [3, 4, 5, 6], [9, 10, 11, 12]])) == 2
 
 
 # Files:

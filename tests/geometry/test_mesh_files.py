@@ -77,7 +77,7 @@ def test_scenes_are_joined_with_their_places() -> None:
     surface = TriMesh.from_trimesh(scene)
     np.testing.assert_allclose(surface.bounds, [[-0.5, -0.5, -0.5], [3.5, 0.5, 0.5]])
     scene.add_geometry(trimesh.PointCloud(np.zeros((1, 3))))
-    with pytest.warns(MeshWarning, match="left out, for they have no triangles: PointCloud"):
+    with pytest.warns(MeshWarning, match="without triangles left out: PointCloud"):
         assert len(TriMesh.from_trimesh(scene).triangles) == 24
     with pytest.raises(TypeError, match="must be a Trimesh or a Scene, got int"):
         TriMesh.from_trimesh(3)
@@ -118,10 +118,10 @@ def test_a_file_says_what_it_leaves_out(tmp_path: Path) -> None:
         warnings.simplefilter("error")
         mesh.to_file(tmp_path / "bare.vtu")
     carrying = mesh.with_embedding(embed_triangles(mesh.vertices, mesh.tets, mesh.boundary()))
-    with pytest.warns(MeshWarning, match=r"a\.vtu is without the embedded surface, for which .*Simulator\.save"):
+    with pytest.warns(MeshWarning, match=r"a\.vtu omits the embedded surface.*Simulator\.save"):
         carrying.to_file(tmp_path / "a.vtu")
     partly = TetMesh(mesh.vertices, mesh.tets, fill=[0.5])
-    with pytest.warns(MeshWarning, match=r"b\.vtu is without the fill, for which"):
+    with pytest.warns(MeshWarning, match=r"b\.vtu omits the fill"):
         partly.to_file(tmp_path / "b.vtu")
 
 
@@ -176,7 +176,7 @@ def test_regions_survive_a_file(tmp_path: Path, suffix: str) -> None:
 def test_formats_without_regions_say_so_and_keep_the_tets(tmp_path: Path, name: str) -> None:
     box = shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
     mesh = TetMesh(box.vertices, box.tets, regions=np.arange(len(box.tets)) % 3 + 1)
-    with pytest.warns(MeshWarning, match=rf"{name} is without the regions; \.mesh, .* keep them"):
+    with pytest.warns(MeshWarning, match=rf"{name} omits the regions; \.mesh, .* hold them"):
         mesh.to_file(tmp_path / name)
     again = TetMesh.from_file(tmp_path / name)
     np.testing.assert_array_equal(again.tets, mesh.tets)

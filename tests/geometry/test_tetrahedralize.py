@@ -375,7 +375,7 @@ def test_progress_is_shown_on_demand(capfd: pytest.CaptureFixture[str]) -> None:
         ({"cells": 5000}, ValueError, "cells=5000 asks for a lattice of .* use fewer cells"),
         ({"method": "delaunay"}, ValueError, 'method must be "lattice" or "tetwild", got \'delaunay\''),
         ({"surface": 3}, TypeError, "surface must be a TriMesh, .* got int"),
-        ({"surface": shapes.single_tet()}, TypeError, "got a TetMesh, which is filled already"),
+        ({"surface": shapes.single_tet()}, TypeError, "surface must be a surface, got a TetMesh"),
         ({"surface": "nothing.obj"}, FileNotFoundError, "no such mesh file"),
         ({"surface": TriMesh(np.ones((3, 3)), [[0, 1, 2]])}, ValueError, "must have an extent"),
     ],

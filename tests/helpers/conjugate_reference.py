@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchpd.plan.preconditioner import has_levels, reference_of_levels
+from torchpd.plan.preconditioner import has_preconditioner, stored_reference
 
 __all__ = ["System", "conjugate_gradients", "stabilised_gradients"]
 
@@ -129,9 +129,9 @@ class System:
     def preconditioner(self) -> Map:
         """M of the levels, and the diagonal where they have no say: on vertices that were held when M was made."""
         inverse = self.inverse.unsqueeze(-1)
-        if not has_levels(self.plan):
+        if not has_preconditioner(self.plan):
             return lambda field: inverse * field
-        _, inertia_of_levels = reference_of_levels(self.plan)
+        _, inertia_of_levels = stored_reference(self.plan)
         known = (inverse != 0) & torch.isfinite(inertia_of_levels).unsqueeze(-1)
 
         def precondition(field: Tensor) -> Tensor:

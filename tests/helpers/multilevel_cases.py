@@ -15,7 +15,7 @@ from scipy.spatial import Delaunay
 import torchpd as pd
 from torchpd import _C
 from torchpd.plan import Plan
-from torchpd.plan.preconditioner import precondition_plan, reference_of_levels
+from torchpd.plan.preconditioner import precondition_plan, stored_reference
 
 SOLVERS = [pd.Multilevel("lbfgs"), pd.Multilevel("momentum"), pd.Multilevel()]
 IDS = ["lbfgs", "momentum", "corotated"]
@@ -93,7 +93,7 @@ def converged(case: Case, **options: Any) -> Array:
 
 def build_levels(sim: pd.Simulator, *, folded: bool) -> dict[str, Any]:
     """The arrays of its preconditioner, which has levels, in float64, with lifts as a GPU has them or as a CPU does."""
-    stiffness, inertia = (array.cpu().double().numpy() for array in reference_of_levels(sim.plan.arrays))
+    stiffness, inertia = (array.cpu().double().numpy() for array in stored_reference(sim.plan.arrays))
     values, order = sim.scene.values(), sim.plan.vertex_order.cpu().numpy()
     return _C.build_multilevel(
         values.rest_positions, values.tets, order, stiffness, inertia,
@@ -164,7 +164,7 @@ class Tables:
 
 def solved_directly(sim: pd.Simulator, most: int = 1024) -> pd.Simulator:
     """The simulator with M = A^-1 where it has up to so many vertices, as on a GPU."""
-    sim.plan = precondition_plan(sim.plan, sim.scene.values(), *reference_of_levels(sim.plan.arrays), most_direct=most)
+    sim.plan = precondition_plan(sim.plan, sim.scene.values(), *stored_reference(sim.plan.arrays), most_direct=most)
     return sim
 
 

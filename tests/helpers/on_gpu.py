@@ -50,7 +50,7 @@ def compiled_for(kernel: str) -> Iterator[str]:
     "far": a grid of a few patches with several tetrahedra a thread, of meshes that have 2400 or more.
     """
     if kernel in ("grid", "far"):
-        with mock.patch.object(regimes, "_GRID_TETS", 2 if kernel == "grid" else 1200):
+        with mock.patch.object(regimes, "_MIN_GRID_TETS", 2 if kernel == "grid" else 1200):
             yield "grid"
     else:
         if kernel == "cluster" and not has_clusters():

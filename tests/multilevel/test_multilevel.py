@@ -12,7 +12,7 @@ from scipy.sparse import bsr_array, csr_array
 
 import torchpd as pd
 from torchpd.common.tables import MULTILEVEL_TABLE, PLAN_TABLE
-from torchpd.plan.preconditioner import has_levels, reference_of_levels
+from torchpd.plan.preconditioner import has_preconditioner, stored_reference
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 ops = torch.ops.torchpd
@@ -201,7 +201,7 @@ def test_a_plan_without_it_is_as_before(dtype: torch.dtype) -> None:
     arrays = sim.plan.arrays
     assert len(arrays) == len(PLAN_TABLE)
     sim.solver = pd.Multilevel()
-    assert has_levels(sim.plan.arrays)
+    assert has_preconditioner(sim.plan.arrays)
     assert [row.name for row in sim.plan.table] == [row.name for row in PLAN_TABLE + MULTILEVEL_TABLE]
     sim.solver = pd.Chebyshev()
     assert all(one is other for one, other in zip(sim.plan.arrays, arrays, strict=True))
@@ -238,7 +238,7 @@ def test_reference_is_what_it_was_made_of(dtype: torch.dtype) -> None:
     sim.set_material(stiffness=torch.stack([sim.stiffness, 3.0 * sim.stiffness]), pin_stiffness=springs)
     sim.solver = pd.Multilevel()
     assert torch.equal(sim.plan.reference_stiffness, 3.0 * torch.full_like(sim.plan.reference_stiffness, 1e5))
-    _, inertia = reference_of_levels(sim.plan.arrays)
+    _, inertia = stored_reference(sim.plan.arrays)
     expected = sim.masses.detach() / sim.time_step**2
     assert float(inertia[0]) == pytest.approx(float(expected[0]) + 5.0, rel=8 * ULP[dtype])
     assert inertia.isinf().tolist() == [number == 1 for number in range(sim.vertices)]

@@ -12,7 +12,7 @@ from runs import noise, same_bits
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.plan.preconditioner import has_levels, reference_of_levels
+from torchpd.plan.preconditioner import has_preconditioner, stored_reference
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -62,8 +62,8 @@ def own_material(sim: pd.Simulator) -> None:
 def test_gradients_and_steps_are_those_of_the_diagonal(own: bool) -> None:
     """With friction that slides, hard and soft pins; the step does not know of the matrix."""
     plain, sim = simulator("solver"), simulator()
-    assert has_levels(sim.plan.arrays)
-    assert not has_levels(plain.plan.arrays)
+    assert has_preconditioner(sim.plan.arrays)
+    assert not has_preconditioner(plain.plan.arrays)
     if own:
         own_material(plain)
         own_material(sim)
@@ -108,16 +108,16 @@ def test_it_is_made_when_it_is_set_and_stays_with_any_solver() -> None:
     assert sim.adjoint == "solver"
     sim.adjoint = "multilevel"
     made = sim.plan
-    assert has_levels(made.arrays)
+    assert has_preconditioner(made.arrays)
     sim.solver = pd.Multilevel()
     assert sim.plan is made
     sim.adjoint = "solver"
     assert sim.plan is made
     sim.solver = pd.Chebyshev()
-    assert not has_levels(sim.plan.arrays)
+    assert not has_preconditioner(sim.plan.arrays)
     sim.adjoint, sim.solver = "multilevel", "auto"
-    assert has_levels(sim.plan.arrays)
-    assert has_levels(copy.deepcopy(sim).plan.arrays)
+    assert has_preconditioner(sim.plan.arrays)
+    assert has_preconditioner(copy.deepcopy(sim).plan.arrays)
     text = str(sim)
     sim.adjoint = "solver"
     assert ("preconditioner of gradients:" in text) != isinstance(sim.solver, pd.Multilevel)
@@ -133,15 +133,15 @@ def test_it_follows_the_material() -> None:
     for one in (sim, plain):
         one.set_material(pin_hard=hard)
     assert sim.plan is not made
-    assert int(reference_of_levels(sim.plan.arrays)[1].isinf().sum()) == 2
+    assert int(stored_reference(sim.plan.arrays)[1].isinf().sum()) == 2
     assert_alike(gradients(sim, state), gradients(plain, state))
     for one in (sim, plain):
         one.pin_hard.fill_(False)  # an optimiser's, or a policy's
         one.set_material(stiffness=3.0 * one.stiffness.detach())
     assert_alike(gradients(sim, state), gradients(plain, state))
-    assert not bool(reference_of_levels(sim.plan.arrays)[1].isinf().any())
+    assert not bool(stored_reference(sim.plan.arrays)[1].isinf().any())
     sim.prepare_solver()
-    torch.testing.assert_close(reference_of_levels(sim.plan.arrays)[0], sim.stiffness.detach())
+    torch.testing.assert_close(stored_reference(sim.plan.arrays)[0], sim.stiffness.detach())
     assert_alike(gradients(sim, state), gradients(plain, state))
 
 
@@ -153,13 +153,13 @@ def test_files_and_precisions_keep_it(tmp_path: Path) -> None:
     sim.save(tmp_path / "sim")
     loaded = pd.Simulator.load(tmp_path / "sim")
     assert loaded.adjoint == "multilevel"
-    assert all(map(torch.equal, reference_of_levels(loaded.plan.arrays), reference_of_levels(sim.plan.arrays)))
+    assert all(map(torch.equal, stored_reference(loaded.plan.arrays), stored_reference(sim.plan.arrays)))
     for other in (loaded, copy.deepcopy(sim)):
         assert all(torch.equal(one, two) for one, two in zip(gradients(other, state), wanted, strict=True))
     single = sim.to(torch.float32)
-    assert has_levels(single.plan.arrays)
+    assert has_preconditioner(single.plan.arrays)
     assert single.plan.dtype == torch.float32
-    assert (single.adjoint, has_levels(single.to("meta").plan.arrays)) == ("multilevel", True)
+    assert (single.adjoint, has_preconditioner(single.to("meta").plan.arrays)) == ("multilevel", True)
 
 
 def test_other_values_are_refused_and_change_nothing() -> None:

@@ -16,7 +16,7 @@ from programs import ROOT
 from torchpd.common.gpu import H100, Properties
 from torchpd.plan import Plan, kernel_benchmark, kernel_costs
 from torchpd.plan.kernel_choice import choose_plan, shared_bytes
-from torchpd.plan.kernel_costs import clusters_together, iteration_microseconds, kernel_microseconds
+from torchpd.plan.kernel_costs import concurrent_environments, iteration_microseconds, kernel_microseconds
 
 # of those that benchmarks/kernels_by_batch.py measures, what is quickly made
 REGULAR = [(3, 3, 3), (15, 3, 3), (8, 5, 5), (15, 4, 4), (25, 5, 5), (19, 8, 8), (40, 8, 8), (39, 15, 15), (60, 24, 24)]
@@ -70,7 +70,7 @@ def test_time_of_an_iteration_by_hand(dtype: torch.dtype, monkeypatch: pytest.Mo
     # 81 environments: a multiprocessor has 3
     assert time("block", 81) == pytest.approx(2.0 + 0.02 * 3 * 750)
     # ten patches, in two groups of 16 multiprocessors one such cluster each: 5 environments take 3 turns
-    assert clusters_together(choose_plan(values, dtype, gpu, "cluster"), gpu) == 2
+    assert concurrent_environments(choose_plan(values, dtype, gpu, "cluster"), gpu) == 2
     assert time("cluster", 5) == pytest.approx(3 * (3.0 + 0.02 * 75))
     # five patches of 150 tetrahedra: eight environments at a time
     assert choose_plan(values, dtype, gpu, "grid", batch=5).patches == 5
@@ -126,8 +126,8 @@ def test_benchmark_takes_the_quickest_of_the_kernels_that_fit(monkeypatch: pytes
     values = box_values((5, 5, 5))
 
     def chosen(batch: int) -> Plan:
-        pick = partial(kernel_benchmark.quickest_plan, key=batch, step=lambda plan: lambda: None)
-        return choose_plan(values, torch.float32, H100, "benchmark", batch=batch, quickest=pick)
+        pick = partial(kernel_benchmark.fastest_plan, key=batch, step=lambda plan: lambda: None)
+        return choose_plan(values, torch.float32, H100, "benchmark", batch=batch, fastest=pick)
 
     plan = chosen(16)
     assert plan.kernel == "grid"

@@ -15,7 +15,7 @@ import torchpd as pd
 from torchpd import _C
 from torchpd.common.tables import PLAN_TABLE
 from torchpd.plan import Plan, compile_plan
-from torchpd.plan.material import in_order, material_of
+from torchpd.plan.material import material_of, material_rows
 from torchpd.reference import elements
 from torchpd.scene import SceneValues
 
@@ -191,7 +191,7 @@ def test_order_of_the_user_does_not_matter() -> None:
 
 def test_patch_size_does_not_matter() -> None:
     values = values_of("slivers")
-    material, x = in_order(material_of(values, torch.float64)), torch.from_numpy(values.rest_positions)[None]
+    material, x = material_rows(material_of(values, torch.float64)), torch.from_numpy(values.rest_positions)[None]
     x = x + 0.01 * torch.randn(x.shape, dtype=x.dtype, generator=torch.Generator().manual_seed(0))
     plans = [compile_plan(values, dtype=torch.float64, patch_size=size) for size in (16, 48, 512, 8192)]
     assert len({plan.patches for plan in plans}) == 4

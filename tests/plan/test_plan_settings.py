@@ -15,7 +15,7 @@ from torchpd.plan import Plan, compile_plan
 from torchpd.plan import placement as placing
 from torchpd.plan.compiled import CompiledScene
 from torchpd.plan.kernel_choice import choose_plan
-from torchpd.plan.preconditioner import precondition_plan, reference_of
+from torchpd.plan.preconditioner import precondition_plan, reference_material
 from torchpd.scene import SceneValues
 from torchpd.simulation import model, settings
 from torchpd.simulation.parametrization import plain_copy
@@ -61,7 +61,7 @@ def test_another_kernel_makes_the_choice_of_auto_anew(monkeypatch: pytest.Monkey
     monkeypatch.setattr(settings, "move_plan", lambda scene, plan, device: plan)
     monkeypatch.setattr(automatic, "spectrum_of", lambda _: Spectrum(1e-6, 1e-6))
     monkeypatch.setattr(automatic, "runs", lambda solver, scene: scene.kernel == "auto")
-    values, reference = sim.scene.values(), reference_of(sim.plan, sim.material(), sim.time_step)
+    values, reference = sim.scene.values(), reference_material(sim.plan, sim.material(), sim.time_step)
     sim.plan = precondition_plan(choose_plan(values, torch.float32, H100, levels=True), values, *reference)
     sim.kernel = "grid"
     assert (sim.plan.kernel, type(sim.solver), asked) == ("grid", pd.Chebyshev, [("grid", pd.Chebyshev)])
@@ -77,9 +77,9 @@ def test_a_move_that_is_refused_leaves_the_choice_of_auto(monkeypatch: pytest.Mo
     sim = pd.Simulator(pd.Scene(body, pd.Gravity(), pd.Ground(-1.0)), 1 / 60, solver="auto", progress=False)
     before = sim.plan, sim.choice, sim.solver, sim.iterations
     wanted = SimpleNamespace(device=torch.device("cuda", 0), dtype=torch.float32)
-    monkeypatch.setattr(model, "check_wanted_device", lambda *_: wanted)
+    monkeypatch.setattr(model, "check_target_device", lambda *_: wanted)
     monkeypatch.setattr(settings, "check_solver", lambda solver, _: solver)
-    monkeypatch.setattr(settings, "plan_on", refuse)
+    monkeypatch.setattr(settings, "plan_for_device", refuse)
     with pytest.raises(RuntimeError, match="no room"):
         sim.to("cuda")
     assert isinstance(sim.solver, pd.Multilevel)
@@ -107,7 +107,7 @@ def test_bars_show_for_another_device_too(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(placing, "properties_of", lambda _: H100)
     for progress in (True, False):
         sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, progress=progress)
-        placing.plan_anew(sim.compiled, torch.float32, torch.device("cuda"))
+        placing.recompile_plan(sim.compiled, torch.float32, torch.device("cuda"))
         assert shown.pop() == progress
         # nobody waits for those that the library makes for itself
         assert not plain_copy(sim).progress
@@ -124,12 +124,12 @@ def test_a_simulator_passes_its_batch_on(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(placing, "choose_plan", chosen)
     monkeypatch.setattr(placing, "properties_of", lambda _: H100)
     sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.single_tet(), 1e4)), 1 / 60, 8, batch=3)
-    placing.plan_anew(sim.compiled, torch.float32, torch.device("cuda"))
+    placing.recompile_plan(sim.compiled, torch.float32, torch.device("cuda"))
     assert asked == [3]
     sim.batch = 4
     assert asked == [3]  # no plan of a CPU knows of it
     monkeypatch.setattr(Plan, "kernel", "stream")
-    monkeypatch.setattr(settings, "plan_anew", lambda own, *_: chosen(own.scene.values(), batch=own.batch))
+    monkeypatch.setattr(settings, "recompile_plan", lambda own, *_: chosen(own.scene.values(), batch=own.batch))
     sim.batch = 5
     assert asked == [3, 5]
     for wrong in (0, "x"):

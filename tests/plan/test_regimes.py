@@ -15,12 +15,12 @@ from programs import ROOT
 
 import torchpd as pd
 from torchpd import _C
-from torchpd.common.gpu import H100, Properties, refuse_full_memory, why_not
+from torchpd.common.gpu import H100, Properties, check_free_memory, unavailable_reason
 from torchpd.common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 from torchpd.plan import KERNELS, Plan, compile_plan, kernel_costs
 from torchpd.plan import kernel_choice as regimes
 from torchpd.plan import placement as placing
-from torchpd.plan.kernel_choice import choose_plan, most_shared_bytes, shared_bytes
+from torchpd.plan.kernel_choice import choose_plan, max_shared_bytes, shared_bytes
 from torchpd.plan.preconditioner import precondition_plan
 from torchpd.scene import SceneValues
 
@@ -33,7 +33,7 @@ def test_auto_takes_the_first_that_fits() -> None:
     """Just enough memory for a kernel chooses it, one byte less the next one."""
     values = box_values((6, 6, 6))
     for dtype in REAL:
-        needs = {name: most_shared_bytes(choose_plan(values, dtype, H100, name), 0, 0) for name in KERNELS[:-1]}
+        needs = {name: max_shared_bytes(choose_plan(values, dtype, H100, name), 0, 0) for name in KERNELS[:-1]}
         assert needs["grid"] < needs["cluster"] < needs["block"]
         for shared, kernel in (
             (needs["block"], "block"),
@@ -45,7 +45,7 @@ def test_auto_takes_the_first_that_fits() -> None:
         ):
             plan = choose_plan(values, dtype, Properties(132, shared, 16))
             assert plan.kernel == kernel
-            assert f"{shared:,} B are there" in plan.why
+            assert f"{shared:,} B are available" in plan.why
             assert all(f"{name} needs" in plan.why for name in KERNELS[: KERNELS.index(kernel)])
 
 
@@ -70,11 +70,11 @@ def test_patches_too_large_for_a_cluster_go_to_a_grid() -> None:
         plan = choose_plan(box_values((6, 4, 4)), dtype, gpu, "cluster")
         assert _C.fits_cluster(REAL[dtype], plan.size("most_pairs"), plan.size("most_interior"))
         with pytest.raises(
-            ValueError, match=rf"'cluster' does not fit this GPU: .*{needs}, .*; take \"grid\" or \"stream"
+            ValueError, match=rf"'cluster' does not fit this GPU: .*{needs}, .*; take \"auto\", \"grid\" or \"stream"
         ):
             choose_plan(large, dtype, gpu, "cluster")
         plan = choose_plan(large, dtype, gpu)
-        assert (plan.kernel, plan.patches) == ("grid", 4116 // regimes._GRID_TETS)
+        assert (plan.kernel, plan.patches) == ("grid", 4116 // regimes._MIN_GRID_TETS)
         assert re.search(needs, plan.why)
 
 
@@ -93,7 +93,7 @@ def test_a_mesh_that_no_cluster_could_have_is_not_cut(monkeypatch: pytest.Monkey
 
 def test_a_gpu_without_clusters_is_told() -> None:
     values = box_values((3, 3, 3))
-    refusal = r'kernel="cluster" needs .*\(NVIDIA compute capability 9\.0\).*has none; take "block", "grid" or "stream"'
+    refusal = r'kernel="cluster" needs .*\(NVIDIA compute capability 9\.0\).*; take "auto", "block", "grid" or "stream"'
     with pytest.raises(ValueError, match=refusal):
         choose_plan(values, torch.float32, A100, "cluster")
 
@@ -107,7 +107,7 @@ def test_who_is_refused_hears_of_kernels_that_may_fit() -> None:
         (large, tight, '"grid" or "stream"'),
     ):
         with pytest.raises(
-            ValueError, match=f"'block' does not fit this GPU: .* are there; take {others}, or \"auto\""
+            ValueError, match=f"'block' does not fit this GPU: .* are available; take \"auto\", {others}"
         ):
             choose_plan(values, torch.float32, gpu, "block")
 
@@ -121,7 +121,7 @@ def test_shared_memory_of_a_cluster() -> None:
         sizes = (plan.size(name) for name in ("most_slots", "most_entries", "most_interior"))
         assert needed == _C.cluster_shared_bytes(real, *sizes, 1, 1)
         assert choose_plan(values, dtype, Properties(132, needed, 16), "cluster").patches == plan.patches
-        with pytest.raises(ValueError, match=rf"cluster needs {needed:,} B, {needed - 1:,} B are there; take"):
+        with pytest.raises(ValueError, match=rf"cluster needs {needed:,} B, {needed - 1:,} B are available; take"):
             choose_plan(values, dtype, Properties(132, needed - 1, 16), "cluster")
 
 
@@ -132,7 +132,7 @@ def test_number_of_patches() -> None:
         assert choose_plan(small, dtype, H100, "block").patches == 1
         grid, tets = choose_plan(small, dtype, H100, "grid").patches, len(small.tets)
         assert grid > 2
-        assert tets / grid >= regimes._GRID_TETS > tets / (grid + 1)
+        assert tets / grid >= regimes._MIN_GRID_TETS > tets / (grid + 1)
         assert choose_plan(small, dtype, Properties(5, 232_448), "grid").patches == 5
         middle = box_values((9, 3, 3))
         cluster, tets = choose_plan(middle, torch.float32, H100, "cluster").patches, len(middle.tets)
@@ -178,18 +178,19 @@ def test_patches_of_a_pipeline_are_larger() -> None:
     plan = choose_plan(box_values((40, 12, 12)), torch.float32, few, "stream")
     assert plan.size("most_slots") <= 640
     half = 24 * plan.size("most_slots") + 12 * plan.size("most_entries")
-    assert 2 * half <= regimes._PIPED_BYTES
+    assert 2 * half <= regimes._PIPELINE_BYTES
 
 
 def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
     values = box_values((12, 12, 12))
     with pytest.raises(
-        ValueError, match=r"'block' does not fit this GPU: .*block needs at least [\d,]+ B, 101,376 B are there; .*grid"
+        ValueError,
+        match=r"'block' does not fit this GPU: .*block needs at least [\d,]+ B, 101,376 B are available; .*grid",
     ):
         choose_plan(values, torch.float32, SMALL, "block")
     with pytest.raises(
         ValueError,
-        match=r"'grid' does not fit this GPU: .*grid needs (at least )?[\d,]+ B, 5,000 B are there; .*stream",
+        match=r"'grid' does not fit this GPU: .*grid needs (at least )?[\d,]+ B, 5,000 B are available; .*stream",
     ):
         choose_plan(values, torch.float32, Properties(132, 5000), "grid")
     with pytest.raises(ValueError, match=r"kernel must be \"auto\""):
@@ -215,13 +216,13 @@ def test_the_way_back_fits_where_the_step_does(
     """Its passes keep a position and a direction of every slot, beside static memory, where a grid has a position."""
     values, real = box_values(cells), torch.finfo(dtype).bits // 8
     plan = choose_plan(values, dtype, H100, kernel, batch=batch)
-    step, most = shared_bytes(plan, 0, 0), most_shared_bytes(plan, 0, 0)
+    step, most = shared_bytes(plan, 0, 0), max_shared_bytes(plan, 0, 0)
     passes = -(-6 * real * plan.size("most_slots") // 16) * 16 + 4 * real * plan.size("most_entries")
     assert most == max(step, passes + _C.pass_static_bytes)
     assert (most > step) == (kernel == "grid")
     # what has room for the step alone gets another plan
     tight = H100._replace(shared=most - 1)
-    assert most_shared_bytes(choose_plan(values, dtype, tight, batch=batch), 0, 0) <= tight.shared
+    assert max_shared_bytes(choose_plan(values, dtype, tight, batch=batch), 0, 0) <= tight.shared
 
 
 def test_what_is_refused_unbuilt_does_not_fit_when_built() -> None:
@@ -263,14 +264,14 @@ def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype)
     """As many for every multiprocessor as fit, also where 16 bits would not count the entries of fewer."""
     values = box_values((54, 11, 11))  # 39 204 tetrahedra
     plan = choose_plan(values, dtype, gpu, levels=True, progress=False)
-    assert plan.for_levels
+    assert plan.for_multilevel
     assert plan.kernel == "stream"
     assert plan.patches % gpu.multiprocessors == 0
     assert shared_bytes(plan, 0, 0) <= gpu.shared
     # not many more than it takes
     assert shared_bytes(plan, 0, 0) >= 0.3 * gpu.shared
     assert choose_plan(box_values((3, 3, 3)), dtype, gpu, levels=True).patches == 1
-    with pytest.raises(ValueError, match='Multilevel runs with kernel="stream" on a GPU'):
+    with pytest.raises(ValueError, match="kernel must be \"stream\" for Multilevel on a GPU, got 'block'"):
         choose_plan(values, dtype, gpu, "block", levels=True)
 
 
@@ -280,7 +281,7 @@ def test_many_environments_of_a_multilevel_solver_get_larger_patches(gpu: Proper
     least = -(-gpu.multiprocessors // 4)
     few, many = (choose_plan(values, dtype, gpu, levels=True, batch=batch) for batch in (least - 1, least))
     assert (few.many, many.many) == (False, True)
-    assert many.for_levels
+    assert many.for_multilevel
     assert shared_bytes(many, 0, 0) <= gpu.shared
     if gpu == H100 and dtype == torch.float32:
         assert (few.patches, many.patches) == (12, 3)
@@ -352,7 +353,7 @@ def test_one_class_for_both_plans(kernel: str, dtype: torch.dtype) -> None:
     assert plan.dtype == dtype
     assert plan.to(dtype=dtype).dtype == dtype
     other = torch.float64 if dtype == torch.float32 else torch.float32
-    with pytest.raises(ValueError, match=r"Plan.to: the plan of a GPU has other arrays in another precision"):
+    with pytest.raises(ValueError, match=rf"Plan.to: dtype must be {dtype} for a GPU plan, got {other}"):
         plan.to(dtype=other)
     assert plan.bytes == sum(array.numel() * array.element_size() for array in plan.arrays)
     assert len(DEVICE_SIZES) == len(plan.sizes)
@@ -382,17 +383,22 @@ def test_why_a_gpu_cannot_be_used(
     facts: tuple[bool, str | None, int] | tuple[bool, str | None, int, tuple[int, int]], words: tuple[str, ...]
 ) -> None:
     for word in words:
-        assert word in why_not(*facts), word
+        assert word in unavailable_reason(*facts), word
 
 
 def test_a_gpu_that_can_be_used() -> None:
-    assert why_not(True, "13.0", 1) == why_not(True, "13.0", 2, (8, 0)) == why_not(True, "13.0", 1, (12, 0)) == ""
+    assert (
+        unavailable_reason(True, "13.0", 1)
+        == unavailable_reason(True, "13.0", 2, (8, 0))
+        == unavailable_reason(True, "13.0", 1, (12, 0))
+        == ""
+    )
 
 
 def test_too_little_memory_is_a_sentence() -> None:
-    refuse_full_memory(1000, 1000)
-    with pytest.raises(RuntimeError, match=r"step need 1,001 B of memory on the GPU and 1,000 B are free: free some"):
-        refuse_full_memory(1001, 1000)
+    check_free_memory(1000, 1000)
+    with pytest.raises(RuntimeError, match=r"step need 1,001 B of memory on the GPU and 1,000 B are free"):
+        check_free_memory(1001, 1000)
 
 
 def test_plans_are_moved_between_alike_devices_only(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from runs import moving, same_bits, simulate
 import torchpd as pd
 from torchpd.plan import KERNELS
 from torchpd.plan.material import named_arrays
-from torchpd.plan.placement import check_wanted_device
+from torchpd.plan.placement import check_target_device
 from torchpd.scene.solvers import Solver
 
 pytestmark = pytest.mark.usefixtures("poisoned")
@@ -268,7 +268,7 @@ def test_errors_of_others_are_left_alone() -> None:
         raise RuntimeError("something else")
 
     with pytest.raises(RuntimeError, match=r"^something else$"):
-        check_wanted_device(fail, torch.empty(0))
+        check_target_device(fail, torch.empty(0))
 
 
 def test_capture_wants_a_gpu() -> None:

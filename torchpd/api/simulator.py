@@ -15,7 +15,7 @@ from ..common.synonyms import Renamed, no_attribute
 from ..files.simulation_file import SavedSimulation, load_simulation, reading, save_simulation
 from ..files.summary import describe
 from ..plan.material import named_arrays
-from ..plan.preconditioner import has_levels, precondition_plan, reference_of_levels
+from ..plan.preconditioner import has_preconditioner, precondition_plan, stored_reference
 from ..scene.solvers import Solver
 from ..scene.targets import Targets
 from ..simulation.cuda_graph import CapturedStep
@@ -187,7 +187,7 @@ class Simulator(Stepper):
             choice=self.choice,
             material=material,
             trained=[name for name, value in material.items() if value.requires_grad],
-            reference=reference_of_levels(self.plan.arrays) if has_levels(self.plan.arrays) else None,
+            reference=stored_reference(self.plan.arrays) if has_preconditioner(self.plan.arrays) else None,
         )
 
 
@@ -198,7 +198,7 @@ def _restored(saved: SavedSimulation) -> Simulator:
         getattr(sim, name).requires_grad_()
     reference = saved.reference
     # the bits of a preconditioner follow from mesh, stiffness and inertia
-    if reference is not None and not all(map(torch.equal, reference, reference_of_levels(sim.plan.arrays))):
+    if reference is not None and not all(map(torch.equal, reference, stored_reference(sim.plan.arrays))):
         sim.plan = precondition_plan(sim.plan, sim.scene.values(), *reference)
     sim.choice = saved.choice
     sim.named_iterations = saved.named_iterations

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..plan.cpu_plan import compile_plan
-from ..plan.material import in_order, material_of
+from ..plan.material import material_of, material_rows
 from ..reference.problem import StepProblem
 
 __all__ = ["CompiledStep", "CountedStep"]
@@ -43,7 +43,7 @@ class CompiledStep(CountedStep):
     def _elements(self) -> tuple[list[Tensor], list[Tensor]]:
         """Material and plan."""
         plan = compile_plan(self.values, dtype=torch.float64, progress=False)
-        return in_order(material_of(self.values, torch.float64)), list(plan.arrays)
+        return material_rows(material_of(self.values, torch.float64)), list(plan.arrays)
 
     @cached_property
     def _quadratic(self) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..plan.cpu_plan import compile_plan
-from ..plan.material import in_order, material_of
+from ..plan.material import material_of, material_rows
 from ..plan.preconditioner import precondition_plan
 from ..reference.problem import StepProblem
 
@@ -42,7 +42,7 @@ class NewtonKrylov:
     def __init__(self, problem: StepProblem, passes: list[int]) -> None:
         values = problem.values
         plan = compile_plan(values, dtype=torch.float64, progress=False)
-        self.material = in_order(material_of(values, torch.float64))
+        self.material = material_rows(material_of(values, torch.float64))
         inertia = torch.from_numpy(np.where(problem.free, problem.weight, np.inf))
         levels = precondition_plan(plan, values, torch.from_numpy(values.stiffness.copy()), inertia)
         self.elements, self.levels = list(plan.arrays), list(levels.arrays)

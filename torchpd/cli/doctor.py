@@ -18,7 +18,7 @@ from typing import Any
 import torch
 
 from ..common.extension import BUILD_COMMAND, load_extension
-from ..common.gpu import DOCTOR, LEAST_CAPABILITY, why_not
+from ..common.gpu import DOCTOR, MIN_CAPABILITY, unavailable_reason
 from ..common.packages import OPTIONAL, REQUIRED, Package, is_installed, missing_packages
 from ..common.toolkit import Toolkit, find_toolkit
 from ..version import __version__
@@ -59,7 +59,7 @@ def _devices() -> list[tuple[str, str]]:
     rows = [("cpu", f"{os.cpu_count()} logical cores, {torch.get_num_threads()} threads in use")]
     for index in range(torch.cuda.device_count()):
         device = torch.cuda.get_device_properties(index)
-        old = "" if (device.major, device.minor) >= LEAST_CAPABILITY else ": too old, the kernels need 8.0"
+        old = "" if (device.major, device.minor) >= MIN_CAPABILITY else ": too old, the kernels need 8.0"
         facts = f"compute capability {device.major}.{device.minor}{old}, {device.total_memory / 2**30:.0f} GiB"
         rows.append((f"cuda:{index}", f"{device.name}, {facts}"))
     return [*rows, ("NVIDIA driver", _driver())]
@@ -133,7 +133,7 @@ def notes() -> list[str]:
         return []
     count = torch.cuda.device_count()
     best = max((torch.cuda.get_device_capability(index) for index in range(count)), default=None)
-    reason = why_not(True, torch.version.cuda, count, best).removesuffix(f"; {DOCTOR}")
+    reason = unavailable_reason(True, torch.version.cuda, count, best).removesuffix(f"; {DOCTOR}")
     return [f"CUDA is built, but there is no GPU to run on: {reason}"] if reason else []
 
 

@@ -1,4 +1,4 @@
-"""Whether the compiled module `torchpd._C` can be loaded, and what to do when it cannot."""
+"""Loading of the compiled module `torchpd._C`, and the error that names the fix."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BUILD_COMMAND = "`make setup` in a checkout, or `pip install --no-build-isolatio
 
 
 def load_extension() -> tuple[ModuleType | None, str]:
-    """`torchpd._C` and an empty reason, or None and the reason."""
+    """Load `torchpd._C`: the module and an empty reason, or None and the reason."""
     try:
         return importlib.import_module("torchpd._C"), ""
     except ImportError as error:
@@ -21,6 +21,6 @@ def load_extension() -> tuple[ModuleType | None, str]:
 
 
 def extension_error(name: str) -> ImportError:
-    """What to raise for a name of the package that needs the extension."""
+    """Error for a name of the package that needs the extension."""
     reason = load_extension()[1]
     return ImportError(f"torchpd.{name} needs the compiled extension ({reason}): build it with {BUILD_COMMAND}")

@@ -1,4 +1,4 @@
-"""What a GPU must have before a simulator moves there, and what to do where it lacks that."""
+"""Requirements of a simulator on a GPU, and the errors that name the fix."""
 
 from __future__ import annotations
 
@@ -9,49 +9,51 @@ import torch
 __all__ = [
     "DOCTOR",
     "H100",
-    "LEAST_CAPABILITY",
+    "MIN_CAPABILITY",
     "Properties",
+    "check_free_memory",
     "free_memory",
     "properties_of",
-    "refuse_full_memory",
-    "seen_devices",
-    "why_not",
+    "unavailable_reason",
+    "visible_devices",
 ]
 
-LEAST_CAPABILITY = (8, 0)
+MIN_CAPABILITY = (8, 0)
 DOCTOR = "`python -m torchpd doctor` says more"
 
 
 class Properties(NamedTuple):
-    """What the choice of a kernel depends on."""
+    """Properties of a GPU that the choice of a kernel depends on."""
 
     multiprocessors: int
-    shared: int  # bytes of shared memory that a block may have
-    cluster: int = 1  # blocks that may reach each other's shared memory, at most
+    shared: int  # most shared memory per block [bytes]
+    cluster: int = 1  # most blocks per cluster
 
 
-H100 = Properties(132, 232_448, cluster=16)  # that of the measurements
+H100 = Properties(132, 232_448, cluster=16)  # the GPU of the measurements
 
 
 def properties_of(device: torch.device) -> Properties:
-    """Those of a GPU."""
-    from .. import _C  # the doctor works without it
+    """Read the properties of a GPU."""
+    from .. import _C  # imported here: the doctor works without the extension
 
     found = torch.cuda.get_device_properties(device)
-    # missing from the stubs of torch
+    # missing from the type stubs of torch
     shared: int = found.shared_memory_per_block_optin  # type: ignore[attr-defined]
     with torch.cuda.device(device):
         return Properties(found.multi_processor_count, shared, _C.largest_cluster())
 
 
-def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple[int, int] | None = None) -> str:
-    """Why no simulator can run on a GPU, with the way out; empty when it can.
+def unavailable_reason(
+    built: bool, torch_cuda: str | None, devices: int, capability: tuple[int, int] | None = None
+) -> str:
+    """Reason why no simulator can run on a GPU, with the fix; empty if one can.
 
     Args:
         built: whether the extension has CUDA kernels.
         torch_cuda: `torch.version.cuda`, None for a CPU build of torch.
-        devices: how many torch sees.
-        capability: of the one that is wanted, if known.
+        devices: number of GPUs that torch sees.
+        capability: compute capability of the requested GPU, if known.
     """
     if torch_cuda is None:
         return (
@@ -64,10 +66,10 @@ def why_not(built: bool, torch_cuda: str | None, devices: int, capability: tuple
             f"build torchpd again; {DOCTOR}"
         )
     if devices == 0:
-        return f"torch sees no CUDA device: look at the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES; {DOCTOR}"
-    if capability is not None and capability < LEAST_CAPABILITY:
+        return f"torch sees no CUDA device: check the driver (nvidia-smi) and CUDA_VISIBLE_DEVICES; {DOCTOR}"
+    if capability is not None and capability < MIN_CAPABILITY:
         return (
-            f"the GPU has compute capability {_dotted(capability)} and the kernels need {_dotted(LEAST_CAPABILITY)} or "
+            f"the GPU has compute capability {_dotted(capability)} and the kernels need {_dotted(MIN_CAPABILITY)} or "
             'newer (Ampere): take another device, or stay on the CPU with .to("cpu")'
         )
     return ""
@@ -77,23 +79,23 @@ def _dotted(capability: tuple[int, int]) -> str:
     return ".".join(map(str, capability))
 
 
-def seen_devices() -> str:
-    """In words, for who has asked for another one."""
+def visible_devices() -> str:
+    """List the GPUs that torch sees, for an error message."""
     names = [f"cuda:{index} ({torch.cuda.get_device_name(index)})" for index in range(torch.cuda.device_count())]
-    return f"torch sees {', '.join(names) or 'none'}; CUDA_VISIBLE_DEVICES says which ones it may see"
+    return f"torch sees {', '.join(names) or 'none'}; CUDA_VISIBLE_DEVICES limits them"
 
 
 def free_memory(device: torch.device) -> int:
-    """Bytes that torch could still hand out on a GPU."""
+    """Bytes that torch can still allocate on a GPU."""
     free, _ = torch.cuda.mem_get_info(device)
     return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
 
 
-def refuse_full_memory(needed: int, free: int) -> None:
-    """A sentence instead of a failed allocation halfway."""
+def check_free_memory(needed: int, free: int) -> None:
+    """Raise an error before an allocation would fail halfway."""
     if needed > free:
         raise RuntimeError(
-            f"Simulator: plan, material and a step need {needed:,} B of memory on the GPU and {free:,} B are free: "
-            "free some (torch.cuda.empty_cache(), other processes), take a coarser mesh, torch.float32 or a smaller "
-            'batch (kernel="grid" works on fewer environments at a time than "stream"), or stay on the CPU'
+            f"Simulator: plan, material and a step need {needed:,} B of memory on the GPU and {free:,} B are free. "
+            "Free some (torch.cuda.empty_cache(), other processes), or take a coarser mesh, torch.float32, a smaller "
+            'batch or the CPU. kernel="grid" works on fewer environments at a time than "stream".'
         )

@@ -1,7 +1,7 @@
-"""Which C++ runtime the extension is linked with. Used by setup.py too, so nothing of torchpd is imported here.
+"""The C++ runtime that the extension links. Used by setup.py, so nothing of torchpd is imported here.
 
-torch brings the shared libstdc++ along. With a second, static copy in the extension no exception gets from one to the
-other: every error message ends the process.
+torch loads the shared libstdc++. With a second, static copy in the extension no exception passes between both: every
+error message would end the process.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ __all__ = ["libraries_in", "library_names", "runtime_fault", "shared_runtime"]
 
 
 def shared_runtime(compiler: Sequence[str]) -> list[str]:
-    """The compiler's shared libstdc++ as an argument of its linker, where it has one.
+    """Linker argument for the shared libstdc++ of the compiler, if it has one.
 
-    Named like this it comes before the one that the compiler adds by itself, which `-static-libstdc++` makes static.
+    It precedes the library that the compiler adds itself, which `-static-libstdc++` makes static.
     """
     for name in ("libstdc++.so", "libstdc++.so.6"):
         try:
@@ -31,12 +31,12 @@ def shared_runtime(compiler: Sequence[str]) -> list[str]:
 
 
 def library_names(dynamic_section: str) -> list[str]:
-    """The shared libraries that a file needs, from what `readelf -d` prints of it."""
+    """Shared libraries that a file needs, from the output of `readelf -d`."""
     return re.findall(r"\(NEEDED\).*\[(.+)\]", dynamic_section)
 
 
 def libraries_in(extension: Path) -> list[str] | None:
-    """The shared libraries that a compiled extension needs; None where readelf cannot tell."""
+    """Shared libraries that a compiled extension needs; None if readelf cannot tell."""
     try:
         said = subprocess.run(["readelf", "-d", str(extension)], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
@@ -45,12 +45,12 @@ def libraries_in(extension: Path) -> list[str] | None:
 
 
 def runtime_fault(libraries: Sequence[str], compiler: str) -> str:
-    """What is wrong with a Linux extension that needs these libraries; empty when nothing is."""
+    """Fault of a Linux extension that needs these libraries, with the fix; empty if there is none."""
     if any(library.startswith("libstdc++.so") for library in libraries):
         return ""
     return (
-        f"`{compiler}` links libstdc++ statically, as the extension needs {', '.join(libraries) or 'no library'}, and "
-        "with a copy of its own beside torch's every error message would crash; take -static-libstdc++ out of CXX, "
-        "CXXFLAGS and LDFLAGS, or install the compiler's shared libstdc++ (Debian and Ubuntu: `apt install g++`), or "
-        "name another compiler in CXX."
+        f"`{compiler}` must link libstdc++ as a shared library, got {', '.join(libraries) or 'no library'}: with a "
+        "static copy beside that of torch every error message would crash. Remove -static-libstdc++ from CXX, CXXFLAGS "
+        "and LDFLAGS, or install the compiler's shared libstdc++ (Debian and Ubuntu: `apt install g++`), or name "
+        "another compiler in CXX."
     )

@@ -1,4 +1,4 @@
-"""How much memory a process may have: the machine's, or what its container is limited to, which psutil does not see."""
+"""Memory available to the process: that of the machine, or the container limit, which psutil ignores."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ __all__ = ["host_memory"]
 
 
 def host_memory(root: Path = Path("/")) -> int:
-    """Bytes: all of the machine's, or the least limit of the control groups (versions 1 and 2) around this process.
+    """Memory in bytes: that of the machine, or the least limit of the enclosing control groups (versions 1 and 2).
 
     Args:
-        root: of the file system that tells the limits.
+        root: root of the file system with the limits; tests give another one.
     """
     there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return min([there, *_limits(root)])
 
 
 def _limits(root: Path) -> Iterator[int]:
-    """Those of the group and of all around it: inside a container its own may be what is mounted as the root."""
+    """Limits of a group and of its parents; in a container its own limit may be mounted at the root."""
     for controllers, path in _groups(root):
         if controllers == "":  # version 2: one hierarchy
             top, name = root / "sys/fs/cgroup", "memory.max"

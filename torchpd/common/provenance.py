@@ -1,4 +1,4 @@
-"""Where numbers come from: command, machine, versions and commit."""
+"""Provenance of measured numbers: command, machine, versions and commit."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ __all__ = ["describe_run"]
 
 
 def describe_run(command: str, device: torch.device, threads: int) -> dict[str, Any]:
-    """Everything that another run needs to be compared with this one.
+    """Record of a run, with all that a comparison needs.
 
     Args:
-        command: that does it again.
-        device: on which it ran.
-        threads: of the CPU.
+        command: reproduces the run.
+        device: device of the run.
+        threads: CPU threads.
     """
     build = _C.build_info()
     return {
@@ -50,7 +50,7 @@ def describe_run(command: str, device: torch.device, threads: int) -> dict[str, 
 
 
 def _cpu_name() -> str:
-    """The name that the processor gives itself; py-cpuinfo reads the same one in 1.7 s."""
+    """Name of the processor, read from the system; py-cpuinfo reads the same one in 1.7 s."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -59,7 +59,7 @@ def _cpu_name() -> str:
 
 
 def _git_commit() -> str:
-    """Of the working tree, with a plus when it has changes; "unknown" outside of a repository."""
+    """Commit of the working tree, with a plus if it has changes; "unknown" outside of a repository."""
 
     def ask(*words: str) -> str:
         folder = Path(__file__).parent

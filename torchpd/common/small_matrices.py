@@ -1,6 +1,6 @@
-"""Small matrices and vectors that keep their precision: within autocast torch's own products are rounded.
+"""Products of small matrices and vectors in full precision; torch's own are rounded under autocast.
 
-Sums go term by term: the order in which a reduction adds may depend on the batch.
+Sums run term by term: the order of a torch reduction may depend on the batch.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ __all__ = ["dot", "inverse", "length", "product", "root"]
 
 
 def product(A: Tensor, B: Tensor) -> Tensor:
-    """A B of [..., n, k] and [..., k, m], with k terms one after another."""
+    """Product A B of [..., n, k] and [..., k, m], summed over k in order."""
     total = A[..., :, 0, None] * B[..., None, 0, :]
     for k in range(1, A.shape[-1]):
         total = total + A[..., :, k, None] * B[..., None, k, :]
@@ -20,7 +20,7 @@ def product(A: Tensor, B: Tensor) -> Tensor:
 
 
 def inverse(A: Tensor) -> Tensor:
-    """Of well-conditioned matrices [..., 3, 3], by Cramer's rule."""
+    """Inverse of well-conditioned matrices [..., 3, 3] by Cramer's rule."""
     a, b, c = A.unbind(-1)
     rows = [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)]
     result: Tensor = torch.stack(rows, dim=-2) / dot(a, rows[0])[..., None, None]
@@ -34,7 +34,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def root(squared: Tensor) -> Tensor:
-    """Square root whose derivative at zero is zero."""
+    """Square root with derivative zero at zero."""
     return torch.where(squared > 0.0, torch.where(squared > 0.0, squared, 1.0).sqrt(), squared)
 
 

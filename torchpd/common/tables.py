@@ -1,4 +1,4 @@
-"""The tables that C++ declares, as Python sees them."""
+"""Python view of the tables that C++ declares."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = [
 
 
 class PlanRow(NamedTuple):
-    """One line of csrc/views/cpu_plan.def, of multilevel.def, or of gpu_plan.def: a constant array."""
+    """A row of csrc/views/cpu_plan.def, multilevel.def or gpu_plan.def: a constant array."""
 
     name: str
     type: str
@@ -32,7 +32,7 @@ class PlanRow(NamedTuple):
 
 
 class MaterialRow(NamedTuple):
-    """One line of csrc/views/material.def: an array that training may change."""
+    """A row of csrc/views/material.def: a trainable array."""
 
     name: str
     width: int
@@ -41,22 +41,22 @@ class MaterialRow(NamedTuple):
 
     @property
     def dims(self) -> int:
-        """Dimensions without a batch."""
+        """Number of dimensions without a batch."""
         return (self.rows != "one") + (self.width > 1)
 
 
 class SettingRow(NamedTuple):
-    """One line of csrc/views/settings.def: a setting of a step."""
+    """A row of csrc/views/settings.def: a setting of a step."""
 
     name: str
-    type: str  # in schemas: "int", "float" or "bool"
+    type: str  # schema type: "int", "float" or "bool"
     usual: float
-    contract: str  # what the error of an op says that it must
+    contract: str  # contract, for the error of an op
     meaning: str
 
 
 def _columns(array: str) -> dict[str, Any]:
-    """The place of each column in a row: a number, or a slice of several."""
+    """Place of each column in a row: a number, or a slice for several."""
     rows = [row for row in _C.material_columns() if row[0] == array]
     return {name: first if width == 1 else slice(first, first + width) for _, name, first, width, _ in rows}
 
@@ -66,7 +66,7 @@ MULTILEVEL_TABLE = tuple(PlanRow(*row) for row in _C.multilevel_table())
 DEVICE_PLAN_TABLE = tuple(PlanRow(*row) for row in _C.device_plan_table())
 MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
 SETTINGS_TABLE = tuple(SettingRow(*row) for row in _C.settings_table())
-# where the columns of the material's arrays stand in their rows
+# columns of the material arrays
 PLANES, SPHERES = (_columns(array) for array in ("planes", "spheres"))
-# numbers of a GPU plan's `sizes`: csrc/views/gpu_sizes.def
+# names of the `sizes` of a GPU plan: csrc/views/gpu_sizes.def
 DEVICE_SIZES = tuple(_C.device_sizes())

@@ -1,6 +1,6 @@
-"""Which CUDA toolkit a build uses, or why it uses none. `setup.py` and the doctor both ask here.
+"""Choice of the CUDA toolkit of a build, or the reason for a build without CUDA. Used by `setup.py` and the doctor.
 
-Stands alone (no import from the package), because `setup.py` runs it before the package can be imported.
+Imports nothing from the package, because `setup.py` runs it before the package can be imported.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 __all__ = [
     "CUDA_ARCHITECTURES",
-    "LEAST_RELEASE",
+    "MIN_RELEASE",
     "NVCC_FLAGS",
     "NVCC_PACKING",
     "Toolkit",
@@ -21,26 +21,26 @@ __all__ = [
     "find_toolkit",
 ]
 
-# torch asks a visible GPU when TORCH_CUDA_ARCH_LIST is unset, which fails on a build machine without one.
-# The PTX of the last architecture lets newer devices compile it when they load it.
+# Without TORCH_CUDA_ARCH_LIST torch asks a visible GPU, which fails on a build machine without one. Newer devices
+# compile the PTX of the last architecture when they load it.
 CUDA_ARCHITECTURES = "8.0;9.0+PTX"
-# --fmad=false: the code says itself where to fuse, as for the CPU.
+# --fmad=false: the code names the fused operations itself, as for the CPU.
 NVCC_FLAGS = ("-std=c++20", "-O3", "--expt-relaxed-constexpr", "--fmad=false")
-# Two architectures at a time, and code that is a quarter as large on disk: neither changes what runs.
+# Compile two architectures at a time, and compress the code to a quarter; neither changes the result.
 NVCC_PACKING = ("--threads=2", "-Xfatbin=-compress-all")
-LEAST_RELEASE = "12.3"  # the first with PTX 8.3, which has the words of 128 bits of csrc/cuda/common/reductions.h
+MIN_RELEASE = "12.3"  # first release with PTX 8.3, needed for the 128-bit words of csrc/cuda
 
 
 class Toolkit(NamedTuple):
-    """A CUDA toolkit, or the reason why a build goes without."""
+    """A CUDA toolkit, or the reason for a build without CUDA."""
 
-    home: str | None  # folder that holds bin/nvcc; None when CUDA is left out
-    release: str  # of nvcc, such as "13.0"; empty when there is none
-    reason: str  # why CUDA is left out; empty when it is used
+    home: str | None  # folder that holds bin/nvcc; None without CUDA
+    release: str  # release of nvcc, such as "13.0"; empty without one
+    reason: str  # reason for a build without CUDA; empty with CUDA
 
 
 def _nvcc_release(home: str) -> str:
-    """The release that nvcc states, such as "13.0"; empty when it cannot be run."""
+    """Release of nvcc, such as "13.0"; empty if it does not run."""
     nvcc = Path(home) / "bin" / "nvcc"
     try:
         answer = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=True)
@@ -55,11 +55,11 @@ def _numbers(release: str) -> tuple[int, ...]:
 
 
 def choose_toolkit(home: str | None, release: str, torch_cuda: str | None) -> Toolkit:
-    """Decide from the facts alone; whether a GPU is visible is not one of them.
+    """Choose from the given facts; a visible GPU is not one of them.
 
     Args:
-        home: folder of the toolkit, None when there is none.
-        release: of its nvcc, empty when it cannot be run.
+        home: folder of the toolkit; None without one.
+        release: release of its nvcc; empty if it does not run.
         torch_cuda: `torch.version.cuda`, None for a CPU build of torch.
     """
     if torch_cuda is None:
@@ -70,14 +70,14 @@ def choose_toolkit(home: str | None, release: str, torch_cuda: str | None) -> To
         return Toolkit(None, "", f"no working nvcc in {home}/bin")
     if release.split(".")[0] != torch_cuda.split(".")[0]:
         return Toolkit(None, release, f"nvcc is CUDA {release} but torch is built for CUDA {torch_cuda}")
-    if _numbers(release) < _numbers(LEAST_RELEASE):
-        reason = f"nvcc is CUDA {release} and the kernels need {LEAST_RELEASE} or newer: install a newer toolkit"
+    if _numbers(release) < _numbers(MIN_RELEASE):
+        reason = f"nvcc is CUDA {release} and the kernels need {MIN_RELEASE} or newer: install a newer toolkit"
         return Toolkit(None, release, f"{reason} of the same major version, and set CUDA_HOME to it")
     return Toolkit(home, release, "")
 
 
 def find_toolkit() -> Toolkit:
-    """The toolkit that a build started now would use. TORCHPD_CUDA=0 in the environment leaves CUDA out."""
+    """Find the toolkit that a build would use now. TORCHPD_CUDA=0 in the environment disables CUDA."""
     import torch
 
     if os.environ.get("TORCHPD_CUDA") == "0":

@@ -1,18 +1,20 @@
-"""How many iterations a solver will need, foretold from the weights of the step alone: nothing is solved.
+"""Convergence estimate: the iterations that a solver needs, from the weights of a step, without solving.
 
-The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from below, and with it the rate of the
-Jacobi and Chebyshev iterations. What `Multilevel` needs does not depend on the mesh, but on mu n^(2/3), n vertices of a
-body: about rho L^2 / (E h^2), how far a wave travels in a step against the size L of the body. It grows with the
-logarithm of that, with constants fitted to random scenes and to beams of 936 to 95499 vertices. On 132 random scenes
-without contacts nine of ten needed 0.2 to 1.4 times the forecast, meshes with slivers and steps that are a rigid motion
-the least, on 65 with contacts Chebyshev 0.2 to 1.25 times (`benchmarks/forecast.py`).
+The smallest ratio mu of inertia to diagonal bounds the spectrum of D^-1 A from below. It gives the rate of the Jacobi
+and Chebyshev iterations (Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11).
 
-With smooth planes the forecast of `Multilevel` is that of the step in which a stiff body lands on a face: two square
-roots of what Chebyshev needs, and a seventh of it at least with slivers or stiffness that varies much within a body
-(`benchmarks/landings.py`); most steps need far less. With friction or balls, and with schedules that do not know the
-rigid turns of a body, it is a bound: what Chebyshev needs. `Simulator.tune` measures instead.
+`Multilevel` depends on mu n^(2/3), with n the vertices of a body, and not on the mesh resolution. That number is about
+rho L^2 / (E h^2): the distance that a wave travels in a step, relative to the body size L. The iterations grow with its
+logarithm. The constants are fitted to random scenes and to beams of 936 to 95499 vertices.
 
-Source of the rates: Young, Iterative Solution of Large Linear Systems, 1971, chapters 5 and 11.
+Accuracy (`benchmarks/forecast.py`): on 132 random scenes without contacts nine of ten needed 0.2 to 1.4 times the
+estimate. Meshes with slivers, and steps that are a rigid motion, needed the least. On 65 scenes with contacts Chebyshev
+needed 0.2 to 1.25 times.
+
+With smooth planes the estimate of `Multilevel` is for the impact of a stiff body on a face (`benchmarks/landings.py`).
+It is two square roots of the count of Chebyshev, and at least a seventh of that count with slivers or strongly varying
+stiffness; most steps need far fewer. With friction or spheres, and with schedules that do not treat rigid rotations, it
+is an upper bound: the count of Chebyshev. `Simulator.tune` measures instead.
 """
 
 from __future__ import annotations
@@ -44,53 +46,53 @@ __all__ = [
 ]
 
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/solver/chebyshev.h
-# iterations of Multilevel for a tenth of the error: least + slope * log10(1 / (mu n^(2/3)))
+# Multilevel: iterations per tenth of the error = least + slope * log10(1 / (mu n^(2/3)))
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
-# of Multilevel where something lands, in those of Chebyshev for an error of 1e-3, and in their square roots
+# Multilevel at an impact: factors on the Chebyshev count for an error of 1e-3, and on its square root
 _LANDING_SHARE, LANDING_ROOTS = 1.0 / 7.0, 2.0
-# of a body that is not uneven: the smallest dihedral angle, and how much stiffer one tetrahedron is than another, which
-# is up to ten times where `tetrahedralize` leaves some partly empty
+# limits of an even body: smallest dihedral angle, and largest ratio of stiffness between tetrahedra; `tetrahedralize`
+# leaves a ratio of up to ten where tets are partly filled
 _EVEN_ANGLE, _EVEN_STIFFNESS = math.radians(5.0), 30.0
 _MOST = 10_000
-# iterations of Multilevel that "auto" takes at most: what a bound asks beyond that hardly a step needs
+# most iterations of Multilevel that "auto" takes: hardly any step needs more, though the bound may ask for it
 MOST_OF_LEVELS = 1_000
-FAR_TOO_FEW = 0.1  # error that is left
+FAR_TOO_FEW = 0.1  # remaining error
 _smallest_angles: WeakKeyDictionary[TetMesh, float] = WeakKeyDictionary()
 
 
 class UnsolvedWarning(UserWarning):
-    """Iterations that nobody named, the default or those of "auto", are far too few for this time step and material."""
+    """Warning: the default iterations, or those of "auto", are far too few for this time step and material."""
 
 
 class Spectrum(NamedTuple):
-    """Bounds on the smallest eigenvalue of D^-1 A, D the weighted diagonal, of the worst environment."""
+    """Lower bounds on the smallest eigenvalue of D^-1 A, with D the weighted diagonal, for the worst environment."""
 
-    least: float  # mu: smallest ratio a / D of a vertex that is free, in (0, 1]
-    slow: float  # the same for modes that reach across the mesh, which one flat element does not slow down
+    least: float  # mu: smallest ratio a / D of a free vertex, in (0, 1]
+    slow: float  # the same for modes across the mesh, which a single flat element does not slow down
 
 
 class Forecast(NamedTuple):
-    """Of one solver on one scene: the error falls by exp(-rate) an iteration."""
+    """Convergence estimate of one solver on one scene: the error falls by exp(-rate) per iteration."""
 
     rate: float
 
     def iterations(self, error: float) -> int:
-        """About how many reach an error |x - x*| / |x_0 - x*| in (0, 1)."""
+        """Iterations until the relative error |x - x*| / |x_0 - x*| falls to `error`, in (0, 1)."""
         return max(1, math.ceil(math.log(1.0 / error) / self.rate - 1e-9))
 
     def words(self, error: float) -> str:
-        """`iterations` in words; of very large numbers the rate is not good enough to tell."""
+        """`iterations` as text; very large counts are only named as such."""
         number = self.iterations(error)
         return f"about {number}" if number <= _MOST else f"more than {_MOST:,}"
 
     def error(self, iterations: int) -> float:
-        """About what so many leave; 1 is the first iterate."""
+        """Estimated relative error after a number of iterations; 1 is the first iterate."""
         return math.exp(-self.rate * iterations)
 
 
 @torch.no_grad()
 def spectrum_of(compiled: CompiledScene) -> Spectrum | None:
-    """From the present material and time step; None on "meta", where there are no values, and without a free vertex."""
+    """Spectral bounds for the present material and time step; None on "meta" or without a free vertex."""
     if compiled.device.type == "meta" or (compiled.plan.kernel is None) != (compiled.device.type == "cpu"):
         return None
     inertia, diagonal = step_diagonal(compiled.plan.arrays, compiled.material, compiled.time_step)
@@ -102,7 +104,7 @@ def spectrum_of(compiled: CompiledScene) -> Spectrum | None:
     sums = (torch.where(free, array, 0.0).sum(1) for array in (inertia, diagonal))
     mean = torch.nan_to_num(next(sums) / next(sums), nan=1.0)
     least = float(ratio.min())
-    # the guarded schedule takes no more momentum than this ratio asks for, so only below it does a flat element matter
+    # the guarded schedule limits its momentum to this ratio, so a flat element matters only below it
     floor = (1.0 - _LARGEST_RHO) / Chebyshev().settings()["relaxation"]
     slow = float(torch.maximum(ratio.amin(1), mean.clamp(max=floor)).min())
     valid = math.isfinite(least) and 0.0 < least <= slow <= 1.0
@@ -110,13 +112,13 @@ def spectrum_of(compiled: CompiledScene) -> Spectrum | None:
 
 
 def _limit(rho: float) -> float:
-    """b of omega = 1 + b, where the weights of the Chebyshev method end."""
+    """Limit b of the weights omega = 1 + b of the Chebyshev method."""
     rho = min(max(rho, 0.0), 1.0 - 1e-15)
     return ((1.0 - math.sqrt(1.0 - rho * rho)) / rho) ** 2 if rho > 0.0 else 0.0
 
 
 def _decay(eigenvalue: float, limit: float) -> float:
-    """Larger root |r| of r^2 - (1 + b) g r + b = 0: what an iteration leaves of the mode g of the Jacobi iteration."""
+    """Larger root |r| of r^2 - (1 + b) g r + b = 0: decay per iteration of a mode with Jacobi eigenvalue g."""
     sum_of_roots = (1.0 + limit) * abs(eigenvalue)
     discriminant = sum_of_roots**2 - 4.0 * limit
     return math.sqrt(limit) if discriminant <= 0.0 else (sum_of_roots + math.sqrt(discriminant)) / 2.0
@@ -125,14 +127,14 @@ def _decay(eigenvalue: float, limit: float) -> float:
 def forecast(
     compiled: CompiledScene, solver: Solver | None = None, spectrum: Spectrum | None = None
 ) -> Forecast | None:
-    """What to expect of a solver on this scene; None where nothing can be said.
+    """Convergence estimate of a solver on this scene; None without one.
 
-    That is so for the plain diagonal, with which iterations may diverge, and where `spectrum_of` has nothing.
+    There is none for the plain diagonal, whose iterations may diverge, and without spectral bounds.
 
     Args:
-        compiled: with time step and material.
-        solver: that of the scene when None.
-        spectrum: when known already.
+        compiled: scene, time step and material.
+        solver: None takes that of the scene.
+        spectrum: if known already.
     """
     solver = compiled.solver if solver is None else solver
     spectrum = spectrum_of(compiled) if spectrum is None else spectrum
@@ -149,7 +151,7 @@ def forecast(
     limit = 0.0
     if isinstance(solver, (Chebyshev, Multilevel)):
         limit = _limit(rho if rho > 0.0 else slowest)
-    # the error has little of the modes at the upper end of the spectrum, [mu, 1], but half of it of the middle
+    # the initial error holds little of the upper modes of [mu, 1], but half of the middle ones
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
     rate = -math.log(min(left, 1.0 - 1e-15))
@@ -162,17 +164,17 @@ def forecast(
 
 
 def is_bound(compiled: CompiledScene) -> bool:
-    """Whether the forecast for the solver of the scene is what its hardest steps need, and most of them less."""
+    """Whether the estimate is an upper bound that most steps stay far below."""
     return isinstance(compiled.solver, Multilevel) and has_contacts(compiled)
 
 
 def has_contacts(compiled: CompiledScene) -> bool:
-    """Whether the scene has anything to touch."""
+    """Whether the scene has planes or spheres."""
     return compiled.named["planes"].shape[-2] + compiled.named["spheres"].shape[-2] > 0
 
 
 def is_uneven(compiled: CompiledScene) -> bool:
-    """Whether a body has tetrahedra with an angle below five degrees, or one that is 30 times as stiff as another."""
+    """Whether a body has a dihedral angle below five degrees, or a stiffness ratio of 30 between tetrahedra."""
     if any(_smallest_angle(solid.mesh) < _EVEN_ANGLE for solid in compiled.scene.solids):
         return True
     bodies = (
@@ -188,13 +190,13 @@ def _smallest_angle(mesh: TetMesh) -> float:
 
 
 def has_friction(compiled: CompiledScene) -> bool:
-    """Whether any contact may hold a vertex by friction."""
+    """Whether any contact has friction."""
     columns = {"planes": PLANES["friction"], "spheres": SPHERES["friction"]}
     return any(bool((compiled.named[name][..., column] > 0.0).any()) for name, column in columns.items())
 
 
 def held_up_by(compiled: CompiledScene) -> str:
-    """What may keep `Multilevel` from working: "friction", "a ball" (thin sheets buckle over it), or ""."""
+    """Obstacle to the convergence of `Multilevel`: "friction", "a ball" (thin sheets buckle over it), or ""."""
     if has_friction(compiled):
         return "friction"
     return "a ball" if compiled.named["spheres"].shape[-2] else ""

@@ -1,9 +1,9 @@
-"""`solver="auto"`: guarded Chebyshev or Multilevel, whichever is expected to reach an error of 1e-3 sooner.
+"""`solver="auto"`: guarded Chebyshev or Multilevel, whichever should reach an error of 1e-3 sooner.
 
-Decided when the simulator is made, when it moves to another device and by `Simulator.prepare_solver`, from the weights
-of the step (`forecast`) and what an iteration costs on the device, for the batch that the simulator was told. Nothing
-is run or timed, so the choice is the same every time. The batch of a state does not enter: an environment gives the
-same bits alone and in any batch.
+The choice is made when the simulator is created or moved, and by `Simulator.prepare_solver`. It uses the convergence
+estimate (`forecast`) and the cost of an iteration on the device, for the batch given to the simulator. Nothing is
+timed, so the choice is reproducible. The batch of a state has no influence: an environment gives the same bits alone
+and in any batch.
 """
 
 from __future__ import annotations
@@ -46,25 +46,25 @@ __all__ = [
     "warn_of_few_iterations",
 ]
 
-AIM = 1e-3  # error of a step that "auto" sets its iterations for
-MARGIN = 1.8  # times the forecast: enough for 19 of 20 random scenes, and 99 of 100 steps in which a body lands
-PATIENCE = 4  # times that where a tolerance ends easy steps: hard ones, which no forecast sees, need as many
-# iterations at most, times `PATIENCE` where there is a tolerance: beyond them float32 ends, and a step must end, too
+AIM = 1e-3  # relative error that "auto" sets the iterations for
+MARGIN = 1.8  # factor on the estimate: enough for 19 of 20 random scenes, and for 99 of 100 steps with an impact
+PATIENCE = 4  # further factor where a tolerance ends easy steps early: hard steps, which no estimate covers, need it
+# most iterations, times `PATIENCE` with a tolerance: float32 resolves no more, and a step must end
 MOST_OF_CHEBYSHEV = 10_000
-# times that an iteration of Multilevel is as long where something may touch: boxes of 125 to 9,261 vertices that rest
-# took 1.1 to 1.7 times what those that swing do on an H100, 1.1 to 1.4 times on the CPU
+# factor on the time of a Multilevel iteration with contacts: resting boxes of 125 to 9,261 vertices took 1.1 to 1.7
+# times as long as swinging ones on an H100, 1.1 to 1.4 times on the CPU
 ON_CONTACTS = 1.4
-MAKING = 3  # iterations of "lbfgs" that "corotated" must save to be worth its time
+MAKING = 3  # least iterations of "lbfgs" that "corotated" must save
 
 
 _LEVELS = (Multilevel(), Multilevel("lbfgs"))
 
 
 class Cost(NamedTuple):
-    """Time of an iteration in microseconds, n thousand vertices an environment.
+    """Time of an iteration in microseconds, for n thousand vertices per environment.
 
-    `latency` + `each` n of the first environment, `more` n + `square` n^2 of every other one, but no longer than the
-    first: they can take turns.
+    The first environment takes `latency` + `each` n; every further one takes `more` n + `square` n^2, but no longer
+    than the first.
     """
 
     latency: float
@@ -73,11 +73,11 @@ class Cost(NamedTuple):
     square: float = 0.0
 
     def iteration(self, vertices: int, batch: int = 1) -> float:
-        """Microseconds, all environments together."""
+        """Microseconds of an iteration of all environments."""
         return self.first(vertices) + (batch - 1) * self.other(vertices)
 
     def first(self, vertices: int) -> float:
-        """Microseconds of an environment alone."""
+        """Microseconds of one environment alone."""
         return self.latency + self.each * vertices / 1000.0
 
     def other(self, vertices: int) -> float:
@@ -86,18 +86,18 @@ class Cost(NamedTuple):
         return min(self.first(vertices), self.more * thousands + self.square * thousands**2)
 
 
-# Float32. `benchmarks/time_to_error.py` measures these numbers, those of further environments with --batch. The CPU's
-# are of one AVX-512 core, the GPU's of an H100, where Chebyshev's are those of `torchpd.plan.kernel_costs`.
+# Float32, by `benchmarks/time_to_error.py`, further environments with --batch. The CPU is one AVX-512 core, the GPU an
+# H100, where the Chebyshev costs are those of `torchpd.plan.kernel_costs`.
 CPU_CHEBYSHEV, CPU_MULTILEVEL = Cost(0.5, 45.0), Cost(2.0, 170.0)
-# Batches were measured with 1024 environments of 256 and 936 vertices, and with 16 of 3,321 and 10,309; the squares fit
-# these sizes. Up to MOST_DIRECT vertices M is an inverse, without levels; from some 12 thousand on it has three.
+# Batches: 1024 environments of 256 and 936 vertices, 16 of 3,321 and 10,309; the squares are fitted to these. Up to
+# MOST_DIRECT vertices M is an inverse without levels; above about 12 thousand it has three levels.
 _DIRECT = Cost(30.0, 3.0, 0.73, 0.49)
 _TWO_LEVELS, _THREE_LEVELS = Cost(37.0, 0.9, 0.5, 0.098), Cost(49.0, 2.05, 0.5, 0.098)
 _MOST_OF_TWO_LEVELS = 12_000
 
 
 def multilevel_cost(vertices: int, *, on_gpu: bool) -> Cost:
-    """Of an iteration of `Multilevel`."""
+    """Cost of an iteration of `Multilevel`."""
     if not on_gpu:
         return CPU_MULTILEVEL
     if vertices <= MOST_DIRECT:
@@ -107,26 +107,26 @@ def multilevel_cost(vertices: int, *, on_gpu: bool) -> Cost:
 
 @dataclass(frozen=True)
 class Choice:
-    """What "auto" decided."""
+    """Result of "auto"."""
 
     iterations: int
     sets_iterations: bool  # the user gave none
-    why: str  # follows "chosen because"
-    capped: bool = False  # more would be wanted, but a step is to end
+    why: str  # continues "chosen because"
+    capped: bool = False  # more would be needed, but a step must end
 
 
 def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solver, Choice]:
-    """The solver for this scene and device, and why.
+    """Choose the solver for a scene and device, with a reason.
 
-    Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is best for a spectrum of [mu, 1].
+    Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is optimal for a spectrum of [mu, 1]. On smooth planes
+    the iterations of Multilevel are for an impact, a hard one for an uneven body. With a tolerance, and without
+    `iterations`, its cost is compared at the count of other steps.
 
     Args:
-        compiled: with time step, material, device, and the batch to choose for.
-        iterations: given by the user, and then kept: Chebyshev if they suffice for it, else the smaller error, but
-            Chebyshev with friction and balls. None sets as many as are expected to reach an error of `AIM`, times
-            `MARGIN`, up to `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`, and with a tolerance `PATIENCE` times that. On
-            smooth planes those of Multilevel are for a landing, a hard one where a body has slivers or parts of very
-            different stiffness; with a tolerance, and unless you give them, it is compared by what others take.
+        compiled: scene, time step, material, device and batch.
+        iterations: given by the user, and kept: Chebyshev if they suffice for it, else the solver with the smaller
+            error (Chebyshev with friction or spheres). None: the estimate for an error of `AIM`, times `MARGIN`, up to
+            `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`; with a tolerance `PATIENCE` times that.
     """
 
     def chosen(enough: int, why: str, most: int = MOST_OF_CHEBYSHEV) -> Choice:
@@ -139,13 +139,13 @@ def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solv
     spectrum = spectrum_of(compiled)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
     if spectrum is None:
-        return chebyshev, chosen(DEFAULT_ITERATIONS, "nothing is free to move, or values are unknown")
+        return chebyshev, chosen(DEFAULT_ITERATIONS, "all vertices are pinned, or values are unknown")
     if cause := held_up_by(compiled):
         plain = _known(forecast(compiled, chebyshev, spectrum))
-        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may keep Multilevel from working"
+        why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may stall Multilevel"
         return chebyshev, chosen(_enough(plain), why)
     plain, lasting, short = (_known(forecast(compiled, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
-    # the others know nothing of contacts
+    # the other schedules do not treat contacts
     saves = has_contacts(compiled) or short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
     multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
@@ -176,9 +176,9 @@ def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solv
 
 
 def _chebyshev_time(compiled: CompiledScene, batch: int) -> float:
-    """Microseconds of an iteration of so many environments, in float32, on a GPU with its own plan on an H100.
+    """Microseconds of a Chebyshev iteration of a batch in float32; on a GPU for its own plan on an H100.
 
-    So are those of Multilevel, whatever the GPU and precision are: only their ratio matters.
+    The same holds for Multilevel on every GPU and in every precision: only the ratio of both matters.
     """
     if compiled.plan.kernel is None:
         return CPU_CHEBYSHEV.iteration(compiled.vertices, batch)
@@ -186,7 +186,7 @@ def _chebyshev_time(compiled: CompiledScene, batch: int) -> float:
 
 
 def _multilevel_time(compiled: CompiledScene, batch: int) -> float:
-    """The same of `Multilevel`."""
+    """Microseconds of a `Multilevel` iteration of a batch."""
     free = multilevel_cost(compiled.vertices, on_gpu=compiled.plan.kernel is not None).iteration(
         compiled.vertices, batch
     )
@@ -203,7 +203,7 @@ def _enough(expected: Forecast) -> int:
 
 
 def _relaxation(spectrum: Spectrum | None) -> float | None:
-    """Of Chebyshev; None keeps its default, 1.9, which is best for ill-conditioned steps."""
+    """Relaxation of Chebyshev; None keeps its default 1.9, which is best for ill-conditioned steps."""
     if spectrum is None:
         return None
     best = 2.0 / (1.0 + spectrum.least)
@@ -211,7 +211,7 @@ def _relaxation(spectrum: Spectrum | None) -> float | None:
 
 
 def runs(solver: Solver, compiled: CompiledScene) -> bool:
-    """Whether there are kernels for the solver where the scene is."""
+    """Whether there are kernels for the solver on the device of the scene."""
     try:
         check_solver(solver, compiled.device)
     except RuntimeError:
@@ -220,15 +220,15 @@ def runs(solver: Solver, compiled: CompiledScene) -> bool:
 
 
 def warn_of_few_iterations(compiled: CompiledScene, choice: Choice | None, changed: str | None = None) -> bool:
-    """Say so when iterations that nobody named leave more than enough: who gave none may not know of them.
+    """Warn when the default iterations, or those of "auto", leave a large error.
 
     Args:
-        compiled: with the default number of iterations, or that of "auto".
-        choice: of "auto", which was to leave `AIM`; ten times that may be left.
-        changed: what brought another material or time step; None when the simulator is made, or "auto" has chosen.
+        compiled: with the default iterations, or those of "auto".
+        choice: of "auto", which aims at `AIM`; up to ten times that is accepted.
+        changed: name of the call that changed material or time step; None when the simulator was just created.
 
     Returns:
-        Whether it was said.
+        Whether it warned.
     """
     enough, capped = (FAR_TOO_FEW, False) if choice is None else (10.0 * AIM, choice.capped)
     if is_bound(compiled) and (choice is None or capped):
@@ -246,9 +246,9 @@ def warn_of_few_iterations(compiled: CompiledScene, choice: Choice | None, chang
         ways = "Take a shorter time_step, or give iterations=..."
     elif choice is not None:
         what += ' that "auto" chose before'
-        ways = "sim.prepare_solver() chooses anew"
+        ways = "sim.prepare_solver() chooses again"
     warn_user(
-        f"{changed or 'Simulator'}: {what} {verb} an error of about {left:.1g} of a step here (1: nothing solved); "
+        f"{changed or 'Simulator'}: {what} {verb} a relative error of about {left:.1g} per step (1: unsolved); "
         f"{expected.words(1e-2)} reach 1e-2. {ways}",
         UnsolvedWarning,
     )

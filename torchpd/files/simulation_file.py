@@ -23,8 +23,8 @@ from torch import Tensor
 from ..common.checks import check_target_file
 from ..estimate.solver_choice import Choice
 from ..geometry.embedding import Embedding
-from ..geometry.mesh_checks import store
-from ..geometry.tet_mesh import TetMesh, trusted
+from ..geometry.mesh_checks import set_frozen
+from ..geometry.tet_mesh import TetMesh, without_face_checks
 from ..geometry.tri_mesh import TriMesh
 from ..scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from ..scene.pins import PIN_HARD
@@ -261,9 +261,9 @@ def _mesh(number: int, record: Record, tensors: _Tensors) -> TetMesh:
     fill, regions = (
         tensors.array(f"{prefix}.{name}") if tensors.has(f"{prefix}.{name}") else None for name in ("fill", "regions")
     )
-    mesh = trusted(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.tets"), fill, regions)
+    mesh = without_face_checks(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.tets"), fill, regions)
     # tets that were flipped when the mesh was made are upright in the file
-    store(mesh, flipped=record["flipped"])
+    set_frozen(mesh, flipped=record["flipped"])
     if not tensors.has(f"{prefix}.embedding.tets"):
         return mesh
     uvs = tensors.array(f"{prefix}.surface.uvs") if tensors.has(f"{prefix}.surface.uvs") else None
@@ -299,5 +299,5 @@ def _part(number: int, record: Record, meshes: list[TetMesh], parts: Mapping[int
     part: Part = kind(**fields)
     if isinstance(part, Ground):
         # normalising again might change the last bit
-        store(part, normal=fields["normal"])
+        set_frozen(part, normal=fields["normal"])
     return part

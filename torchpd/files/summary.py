@@ -10,10 +10,10 @@ from .. import _C
 from ..common.checks import NO_VALUES
 from ..common.tables import MULTILEVEL_TABLE
 from ..estimate.convergence import FAR_TOO_FEW, forecast, is_bound
-from ..plan.cpu_plan import any_of
+from ..plan.cpu_plan import quoted_choices
 from ..plan.kernel_choice import shared_bytes
 from ..plan.placement import step_bytes
-from ..plan.preconditioner import has_levels
+from ..plan.preconditioner import has_preconditioner
 from ..scene.solvers import Chebyshev, Multilevel, Solver
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def _tuning_lines(sim: Stepper, result: TuningResult | None) -> list[str]:
 def _preconditioner_lines(sim: Stepper) -> list[str]:
     """Levels and bytes of the matrix of `Multilevel`, or of gradients."""
     plan = sim.plan
-    if not has_levels(plan.arrays):
+    if not has_preconditioner(plan.arrays):
         return []
     whose = "" if isinstance(sim.solver, Multilevel) else " of gradients"
     _, _, nodes, _, _, below, direct = plan.level_sizes.tolist()
@@ -148,14 +148,14 @@ def _kernel_lines(sim: Stepper) -> list[str]:
     if kernel == "cluster":
         copies = int((plan.pair_tet < -1).sum()), plan.size("slots") - plan.vertices
         shared = "{} copies of tetrahedra and {} of vertices".format(*copies)
-    launches = _LEVEL_LAUNCHES if plan.for_levels else _LAUNCHES[kernel]
-    others = any_of([name for name in _LAUNCHES if name != kernel])
+    launches = _LEVEL_LAUNCHES if plan.for_multilevel else _LAUNCHES[kernel]
+    others = quoted_choices([name for name in _LAUNCHES if name != kernel])
     if kernel == "block" and sim.batch is None:
         others = others.replace('"cluster"', '"cluster", faster for a few environments (batch=1)')
     # kernels whose plan is the same for every batch
-    fixed = sim.kernel in ("cluster", "stream") and not plan.for_levels
+    fixed = sim.kernel in ("cluster", "stream") and not plan.for_multilevel
     batch = f"; for a batch of {sim.batch}" if sim.batch and not fixed else ""
-    asked = "" if has_levels(plan.arrays) else f"; Simulator(..., kernel=...) can select {others}"
+    asked = "" if has_preconditioner(plan.arrays) else f"; Simulator(..., kernel=...) can select {others}"
     return [
         f"kernel {kernel}: {launches}",
         f"mesh: {patches}, {shared}, {block:,} B of shared memory per thread block",

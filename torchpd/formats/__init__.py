@@ -1,4 +1,4 @@
-"""Mesh files: a reader for each format, one guard around all of them, and tets and triangles of any cells."""
+"""Mesh files: a reader per format, one guard around all readers, and the split of all cells into tets and triangles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a mesh file becomes: a body of tets with the surface that it carries, or a surface alone."""
+"""Bodies and surfaces of mesh files: tets with an embedded surface, or a surface alone."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class Body:
     """Tets of a file, and triangles beside them.
 
     Args:
-        points: [N, 3]; nodes on the edges of cells of higher order are not among them.
+        points: [N, 3], without the edge nodes of cells of higher order.
         tets: point numbers [E, 4].
         regions: a number for each tet [E], or None.
         triangles: point numbers [T, 3] of triangles whose corners belong to tets.
-        notes: what is not as in the file, a sentence each.
+        notes: differences from the file, a sentence each.
     """
 
     points: Array
@@ -46,12 +46,12 @@ class Surface:
 
 
 def holds_body(owner: str, path: PathLike) -> bool:
-    """Whether a file holds cells that have a volume."""
+    """Whether a file has cells with a volume."""
     return any(len(block) and CELLS.get(block.kind, (0, 0))[1] == 3 for block in read(owner, path).cells)
 
 
 def read_body(owner: str, path: PathLike, unit: Unit | None = None) -> Body:
-    """Read a body of tets; a `ValueError` where the file holds none. `unit`: see `torchpd.common.units`."""
+    """Read a body of tets; a `ValueError` if the file holds none. `unit`: see `torchpd.common.units`."""
     content = read(owner, path, unit)
     solid = split.tets_of(content)
     name = Path(path).name
@@ -65,7 +65,7 @@ def read_body(owner: str, path: PathLike, unit: Unit | None = None) -> Body:
     if not within.all():
         outside = int((~within).sum())
         notes.append(f"{outside} of {len(within)} triangles have corners that belong to no tet, and were left out")
-    # What cells of other kinds use has been said of these; the others are strays, of which the mesh speaks.
+    # The notes cover points of cells of other kinds; the mesh reports the others, which no cell uses.
     kept = _kept(content, used, notes)
     number = np.cumsum(kept) - 1
     return Body(
@@ -74,14 +74,14 @@ def read_body(owner: str, path: PathLike, unit: Unit | None = None) -> Body:
 
 
 def read_surface(owner: str, path: PathLike, unit: Unit | None = None) -> Surface:
-    """Read a surface; a `ValueError` where the file holds no triangle, quad or polygon. `unit`: see `units`."""
+    """Read a surface; a `ValueError` if the file holds no face. `unit`: see `torchpd.common.units`."""
     content = read(owner, path, unit)
     flat = split.triangles_of(content)
     if not len(flat.elements):
         raise ValueError(f"{owner}: {Path(path).name} holds no triangles, but {_kinds(content)}{_noted(content)}")
     used = np.zeros(len(content.points), dtype=bool)
     used[flat.elements] = True
-    # The vertices inside of a volume are no part of the surface: that they are left out is nothing to report.
+    # The vertices inside of a volume are no part of its surface: their omission is nothing to report.
     notes = [*content.notes, *flat.notes]
     kept = _kept(content, used, notes)
     number = np.cumsum(kept) - 1
@@ -93,7 +93,7 @@ def read_surface(owner: str, path: PathLike, unit: Unit | None = None) -> Surfac
 
 
 def _kept(content: MeshContent, used: NDArray[np.bool_], notes: list[str]) -> NDArray[np.bool_]:
-    """Which points remain: those that are used, and strays, which no cell of the file uses, where they are finite."""
+    """Mask of the points to keep: those in use, and finite ones that no cell of the file uses."""
     strays = np.zeros(len(used), dtype=bool)
     strays[: len(content.points)] = ~content.in_cells()
     finite: NDArray[np.bool_] = np.asarray(np.isfinite(content.points).all(axis=1))
@@ -116,7 +116,7 @@ def _without_tets(owner: str, name: str, content: MeshContent) -> str:
     came = f"a surface ({_kinds(content)})" if flat else _kinds(content)
     fix = "turn a surface into tetrahedra with torchpd.tetrahedralize(path, cells=...)"
     if not flat:
-        fix = "write it with its cells where it was made"
+        fix = "export it with its cells"
     must = "must hold tetrahedra, hexahedra, wedges or pyramids"
     return f"{owner}: {name} {must}, got {came}{_noted(content)}; {fix}"
 

@@ -1,4 +1,4 @@
-"""What a mesh file holds, before anything is made of it: the value that every reader returns."""
+"""Content of a mesh file: the value that every reader returns."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class Cells:
     """Cells of one kind, in the order of the file.
 
     Args:
-        kind: a name of `CELLS`, "polygon", or "polyhedron" or any other name of what is not read further.
-        corners: vertex numbers [n, corners] in the order of VTK (of polygons: all corners, one polygon after another).
-        sizes: of polygons, how many corners each has [n]; None elsewhere.
+        kind: a name of `CELLS`, "polygon", or "polyhedron" or another name of a cell that is not read further.
+        corners: vertex numbers [n, corners] in the order of VTK (polygons: all corners, one polygon after another).
+        sizes: number of corners of each polygon [n]; None for other kinds.
         regions: region number of each cell [n], or None.
         order: polynomial order in the file.
-        beyond: of cells of higher order, the nodes beyond the corners [n, k], which no mesh of ours uses, or None.
+        beyond: nodes beyond the corners of cells of higher order [n, k], unused by torchpd, or None.
     """
 
     kind: str
@@ -54,14 +54,14 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class MeshContent:
-    """Points and cells of a file, and sentences about what of the file is not among them.
+    """Points and cells of a file, and notes about its omitted parts.
 
     Args:
         points: [N, 3] in the unit of the file, or in metres.
         cells: blocks of cells, in the order of the file.
         uvs: texture coordinates of the points [N, 2], or None.
-        notes: what was left out, repaired or assumed, a sentence each: the caller says them in one `MeshWarning`.
-        in_metres: whether the file declares its unit, which its reader has turned into metres.
+        notes: omissions, repairs and assumptions, a sentence each; the caller puts them into one `MeshWarning`.
+        in_metres: whether the file declares its unit, and the reader converted it to metres.
     """
 
     points: Array
@@ -71,7 +71,7 @@ class MeshContent:
     in_metres: bool = False
 
     def in_cells(self) -> NDArray[np.bool_]:
-        """Which points a cell uses [N], as a corner or beyond."""
+        """Mask of the points that a cell uses [N], as a corner or beyond."""
         used = np.zeros(len(self.points), dtype=bool)
         for block in self.cells:
             used[block.corners] = True

@@ -1,4 +1,4 @@
-"""The one place where a mesh file is opened: whatever its reader runs into becomes an error in words."""
+"""The one place that opens mesh files: every failure of a reader becomes an error that explains it."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ..common.units import Unit, metres
 from .content import CELLS, MeshContent
 from .registry import FORMATS, Format
 
-__all__ = ["PathLike", "existing", "naming", "read"]
+__all__ = ["PathLike", "existing_path", "name_file_in_errors", "read"]
 
 PathLike = str | os.PathLike[str]
 
 _ENDINGS = "the file's name must end in .mesh, .msh, .vtk or .vtu, or as another format that torchpd reads"
 
 
-def existing(path: PathLike) -> Path:
-    """The path of a file that is there; otherwise a `FileNotFoundError`."""
+def existing_path(path: PathLike) -> Path:
+    """Path of an existing file; raises `FileNotFoundError` otherwise."""
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"no such mesh file: {file}")
@@ -36,29 +36,29 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
     """Read points and cells of a mesh file.
 
     Args:
-        owner: who asks, with which the errors begin.
-        path: the file; the suffix of its name says in which format it is.
+        owner: name of the caller, with which errors begin.
+        path: the file; its suffix selects the format.
         unit: of its numbers, see `torchpd.common.units`.
 
     Raises:
-        FileNotFoundError: there is no such file, or one that belongs to it is missing.
+        FileNotFoundError: the file, or one that belongs to it, is missing.
         ModuleNotFoundError: the format needs a package that is not installed.
-        ValueError: anything else, with the name of the file, its format and what was met.
+        ValueError: any other failure; the error gives the name of the file, its format and the cause.
     """
     factor = metres(owner, unit)
-    file = existing(path)
+    file = existing_path(path)
     kind = FORMATS.get(file.suffix.lower())
     if kind is None:
         known = " ".join(sorted(FORMATS))
-        others = "TriMesh.from_trimesh(trimesh.load(path)) takes what else trimesh reads"
+        others = "for other formats of trimesh, TriMesh.from_trimesh(trimesh.load(path))"
         raise ValueError(f"{owner} cannot read {file.name}: {_ENDINGS} ({known}); {others}")
     failure = f"{owner} cannot read {file.name} ({kind.name})"
     if not file.stat().st_size:
         raise ValueError(f"{failure}: the file is empty; write it again")
-    said = io.StringIO()
+    output = io.StringIO()
     try:
-        # Libraries print what is wrong with a file, and some exit the process.
-        with redirect_stdout(said), redirect_stderr(said), warnings.catch_warnings():
+        # libraries print faults of a file, and some exit the process
+        with redirect_stdout(output), redirect_stderr(output), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             content = kind.read(file)
             _check(content)
@@ -73,7 +73,7 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
     except BaseException as error:
         if isinstance(error, (KeyboardInterrupt, GeneratorExit)):
             raise
-        raise ValueError(f"{failure}: {_words(error, said.getvalue(), kind)}") from error
+        raise ValueError(f"{failure}: {_describe(error, output.getvalue(), kind)}") from error
     if unit is None:
         return content
     if content.in_metres:
@@ -82,8 +82,8 @@ def read(owner: str, path: PathLike, unit: Unit | None = None) -> MeshContent:
 
 
 @contextmanager
-def naming(owner: str, path: PathLike) -> Iterator[None]:
-    """Errors of a mesh that is made of a file name the file."""
+def name_file_in_errors(owner: str, path: PathLike) -> Iterator[None]:
+    """Prefix errors of a mesh made from a file with the name of the file."""
     try:
         yield
     except (ValueError, IndexError, TypeError) as error:
@@ -93,7 +93,7 @@ def naming(owner: str, path: PathLike) -> Iterator[None]:
 
 
 def _check(content: MeshContent) -> None:
-    """Every cell must have its corners, which are points of the file, and these be finite."""
+    """Check that cells have all corners, that these are points of the file, and that these points are finite."""
     for block in content.cells:
         corners = CELLS.get(block.kind, (0, 0))[0]
         if corners and block.corners.shape[1:] != (corners,):
@@ -109,19 +109,19 @@ def _check(content: MeshContent) -> None:
         raise ValueError(f"point {bad[0]} (counted from 0) must be finite, got {content.points[bad[0]].tolist()}")
 
 
-def _words(error: BaseException, said: str, kind: Format) -> str:
-    """What a reader met, as one line."""
-    # meshio names the file again, by its path, behind what it met
-    told = re.sub(r" ?Error: Couldn't read file .*", "", " ".join(said.split())).removeprefix("Error: ")
+def _describe(error: BaseException, output: str, kind: Format) -> str:
+    """One-line description of a reader's error."""
+    # meshio appends the path of the file to its errors
+    printed = re.sub(r" ?Error: Couldn't read file .*", "", " ".join(output.split())).removeprefix("Error: ")
     words = " ".join(str(error).split())
     if isinstance(error, ValueError) and words:
-        return f"{words} ({told})" if told and told not in words else words
+        return f"{words} ({printed})" if printed and printed not in words else words
     if isinstance(error, MemoryError):
-        words = f"its reader asks for more memory than there is ({words})" if words else "its reader ran out of memory"
+        words = f"its reader needs more memory than is available ({words})" if words else "its reader ran out of memory"
     elif isinstance(error, RecursionError):
         words = "it is nested too deeply"
-    elif not told:
+    elif not printed:
         words = f"its reader stopped with {type(error).__name__}: {words}" if words else type(error).__name__
     else:
-        words = told
+        words = printed
     return f"{words}; is the file complete, and is it {kind.name}?"

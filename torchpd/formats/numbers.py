@@ -1,4 +1,4 @@
-"""Numbers of files, as text or as bytes; whatever a file declares is compared with what is left before it is read."""
+"""Numbers in files, as text or bytes; every declared count is compared with the remaining size before reading."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ _SPACE = b" \t\n\r\x0b\x0c"
 
 
 def check_room(count: int, least: int, room: int, what: str) -> None:
-    """Refuse a declared count whose rows, of at least so many bytes each, do not fit into what is left of a file."""
+    """Refuse a declared count if the rest of the file is too small for it at the given bytes per row."""
     if count < 0 or count * least > room:
         raise ValueError(f"it declares {count} {what}, but the {room} bytes that are left have no room for them")
 
 
 def check_rows(lines: list[str], count: int, what: str) -> None:
-    """Refuse more or fewer lines, of a row each, than a file declares."""
+    """Refuse a file with more or fewer lines than the rows that it declares."""
     if len(lines) != count:
         raise ValueError(f"it declares {count} {what}, a line each, but {len(lines)} lines come")
 
 
 def text_of(path: Path) -> str:
-    """The text of a file: UTF-8 or, where it is not, Latin-1; without a byte-order mark, lines ended by newlines."""
+    """Text of a file as UTF-8 or else Latin-1, without a byte-order mark, with newlines as line ends."""
     data = path.read_bytes()
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         text = data.decode("utf-16")
@@ -44,7 +44,7 @@ def text_of(path: Path) -> str:
 
 
 def xml_of(data: bytes) -> ElementTree.Element:
-    """The root of an XML document."""
+    """Root element of an XML document."""
     try:
         return ElementTree.fromstring(data.lstrip())
     except ElementTree.ParseError as error:
@@ -52,13 +52,13 @@ def xml_of(data: bytes) -> ElementTree.Element:
 
 
 def lines_of(path: Path, comment: str) -> list[str]:
-    """The lines of a text file without comments, surrounding blanks and empty lines."""
+    """Lines of a text file without comments, surrounding blanks and empty lines."""
     lines = (line.partition(comment)[0].strip() for line in text_of(path).split("\n"))
     return [line for line in lines if line]
 
 
 def _starts(data: bytes) -> Index:
-    """Where words begin."""
+    """Positions at which words begin."""
     letters = ~np.isin(np.frombuffer(data, dtype=np.uint8), np.frombuffer(_SPACE, dtype=np.uint8))
     begins = letters.copy()
     begins[1:] &= ~letters[:-1]
@@ -66,12 +66,12 @@ def _starts(data: bytes) -> Index:
 
 
 def parse(text: bytes, dtype: Any, what: str) -> NDArray[Any]:
-    """All numbers of a text; exponents may be Fortran's (1.0D+00)."""
+    """Parse all numbers of a text; Fortran exponents (1.0D+00) are accepted."""
     try:
         values = np.fromstring(text, dtype=dtype, sep=" ")
         if len(values) == len(_starts(text)):
             return values
-    except ValueError:  # newer versions of NumPy; older ones return the numbers before the first word
+    except ValueError:  # newer versions of NumPy raise; older ones return the numbers before the first word
         pass
     tokens = text.split()
     try:
@@ -99,7 +99,7 @@ class Text:
         self.data, self.at = data, at
 
     def line(self) -> str | None:
-        """The next line, without blanks around it; None at the end."""
+        """Read the next line, without surrounding blanks; None at the end."""
         if self.at >= len(self.data):
             return None
         end = self.data.find(b"\n", self.at)
@@ -109,14 +109,14 @@ class Text:
         return line.decode("latin-1").strip()
 
     def row(self) -> str | None:
-        """The next line that is not blank; None at the end."""
+        """Read the next line that is not blank; None at the end."""
         line = self.line()
         while line is not None and not line:
             line = self.line()
         return line
 
     def words(self, count: int, what: str) -> bytes:
-        """The text of the next words."""
+        """Read the text of the next words."""
         if not 0 <= 2 * count <= len(self.data) - self.at + 1:
             raise ValueError(f"{what} should be {count} numbers, but {len(self.data) - self.at} bytes are left")
         begin, found, chunk = self.at, 0, 32 * count + 64
@@ -136,7 +136,7 @@ class Text:
         return self.data[begin : self.at]
 
     def left(self) -> int:
-        """How many words are left."""
+        """Number of remaining words."""
         return len(self.data[self.at :].split())
 
     def ints(self, count: int, what: str) -> Index:
@@ -156,7 +156,7 @@ class Binary:
         self.integer, self.real, self.size = np.dtype(integer), np.dtype(real), np.dtype(size or integer)
 
     def take(self, dtype: Any, count: int, what: str) -> NDArray[Any]:
-        """The next numbers or records of any type."""
+        """Read the next numbers or records of any type."""
         kind = np.dtype(dtype)
         if not 0 <= count * kind.itemsize <= len(self.data) - self.at:
             left = len(self.data) - self.at
@@ -166,7 +166,7 @@ class Binary:
         return values
 
     def left(self) -> int:
-        """How many bytes are left."""
+        """Number of remaining bytes."""
         return len(self.data) - self.at
 
     def ints(self, count: int, what: str) -> Index:
@@ -180,5 +180,5 @@ class Binary:
 
 
 def words(line: str) -> list[str]:
-    """The words of a line; those in quotes may hold blanks."""
+    """Words of a line; words in quotes may contain blanks."""
     return [a or b or c for a, b, c in re.findall(r"\"([^\"]*)\"|'([^']*)'|(\S+)", line)]

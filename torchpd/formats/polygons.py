@@ -1,4 +1,4 @@
-"""Triangles of polygons."""
+"""Triangulation of polygons."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ import numpy as np
 
 from .content import Array, Index
 
-__all__ = ["Wrong", "triangulate"]
+__all__ = ["FaultyPolygons", "triangulate"]
 
 
-class Wrong(NamedTuple):
-    """How many polygons have fewer than three corners, and how many cross themselves."""
+class FaultyPolygons(NamedTuple):
+    """Number of polygons with fewer than three corners, and of self-intersecting polygons."""
 
     small: int
     crossed: int
 
 
-def triangulate(points: Array, corners: Index, sizes: Index) -> tuple[Index, Index, Wrong]:
+def triangulate(points: Array, corners: Index, sizes: Index) -> tuple[Index, Index, FaultyPolygons]:
     """Cut polygons into triangles without new vertices.
 
-    A polygon is a fan from its vertex of the lowest number, so that neighbours are cut alike; where it is concave, and
-    the fan would fold, its ears are cut off one after another.
+    A polygon is a fan from its vertex of the lowest number, so that neighbours are cut alike. Where the fan of a
+    concave polygon would fold, ears are cut off one after another.
 
     Args:
         points: [N, 3].
@@ -30,7 +30,7 @@ def triangulate(points: Array, corners: Index, sizes: Index) -> tuple[Index, Ind
         sizes: corners of each polygon [n].
 
     Returns:
-        Triangles [T, 3] in the order of the polygons, the polygon of each [T], and how many are not right.
+        Triangles [T, 3] in the order of the polygons, the polygon of each [T], and the counts of faulty polygons.
     """
     starts = np.cumsum(sizes) - sizes
     triangles, owners, crossed = [], [], 0
@@ -48,7 +48,7 @@ def triangulate(points: Array, corners: Index, sizes: Index) -> tuple[Index, Ind
                 fans[row] = ears
         triangles.append(fans.reshape(-1, 3))
         owners.append(np.repeat(which, size - 2))
-    wrong = Wrong(int((sizes < 3).sum()), crossed)
+    wrong = FaultyPolygons(int((sizes < 3).sum()), crossed)
     if not triangles:
         return np.empty((0, 3), dtype=np.int64), np.empty(0, dtype=np.int64), wrong
     owner = np.concatenate(owners)
@@ -62,7 +62,7 @@ def _normals(points: Array, triangles: Index) -> Array:
 
 
 def _is_folded(points: Array, rings: Index, fans: Index) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Whether a triangle of a fan looks against the area vector of its polygon; rounding is no fold."""
+    """Whether a triangle of a fan opposes the area vector of its polygon, beyond rounding."""
     normals = _normals(points, fans)
     total = normals.sum(axis=1, keepdims=True)
     along = np.einsum("ntk,ntk->nt", normals, np.broadcast_to(total, normals.shape))
@@ -70,7 +70,7 @@ def _is_folded(points: Array, rings: Index, fans: Index) -> np.ndarray[tuple[int
 
 
 def _cut_ears(points: Array, ring: Index) -> Index | None:
-    """Triangles [size - 2, 3] of a simple polygon, seen along its area vector, or None where it crosses itself."""
+    """Triangles [size - 2, 3] of a simple polygon, projected along its area vector; None if it intersects itself."""
     places = points[ring] - points[ring].mean(axis=0)
     area = np.cross(places, np.roll(places, -1, axis=0)).sum(axis=0)
     if not np.linalg.norm(area) > 0:
@@ -81,7 +81,7 @@ def _cut_ears(points: Array, ring: Index) -> Index | None:
     flat = places @ np.column_stack([x, np.cross(normal, x)])
     left, triangles, ear = list(range(len(ring))), [], 0
     while len(left) > 3:
-        # go on beside the last one
+        # continue next to the last ear
         turns = ((ear + k - 1) % len(left) for k in range(len(left)))
         ear = next((k for k in turns if _is_ear(flat, left, k)), -1)
         if ear < 0:
@@ -95,18 +95,18 @@ def _cut_ears(points: Array, ring: Index) -> Index | None:
 
 
 def _turn(a: Array, b: Array, c: Array) -> Array:
-    """Twice the area of triangles of the plane, positive where they run counter-clockwise."""
+    """Twice the area of plane triangles, positive if counter-clockwise."""
     (ux, uy), (vx, vy) = (b - a).T, (c - a).T
     return np.asarray(ux * vy - uy * vx)
 
 
 def _is_ear(flat: Array, left: list[int], k: int) -> bool:
-    """Whether corner k turns to the left, and no other corner lies in the triangle with its neighbours."""
+    """Whether corner k is convex and no other corner lies in the triangle with its neighbours."""
     a, b, c = flat[left[k - 1]], flat[left[k]], flat[left[(k + 1) % len(left)]]
     if not _turn(a, b, c) > 0:
         return False
     others = flat[[i for i in left if i not in (left[k - 1], left[k], left[(k + 1) % len(left)])]]
     inside = (_turn(a, b, others) >= 0) & (_turn(b, c, others) >= 0) & (_turn(c, a, others) >= 0)
-    # corners that lie where a or c do are seams to a hole
+    # corners at the position of a or c are seams to a hole
     seams = (others == a).all(axis=1) | (others == c).all(axis=1)
     return not bool((inside & ~seams).any())

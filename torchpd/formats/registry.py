@@ -1,4 +1,4 @@
-"""Which reader reads a file, by its suffix in lower case."""
+"""Readers of mesh files by suffix, in lower case."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ class Format(NamedTuple):
     """A file format.
 
     Args:
-        name: what error messages call it.
-        read: its reader, which raises a `ValueError` without the name of the file where it cannot read one.
+        name: its name in error messages.
+        read: its reader; raises a `ValueError` without the name of the file if it cannot read one.
     """
 
     name: str

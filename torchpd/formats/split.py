@@ -1,8 +1,8 @@
-"""Tets and triangles of any cells: they fill the cells of a file exactly and match across the faces between them.
+"""Split cells of any kind into tets and triangles that fill them exactly and match across shared faces.
 
 A quad face is cut from its vertex of the lowest number, so that both of its sides are cut alike (Dompierre, Labbé,
 Vallet and Camarero 1999, "How to subdivide pyramids, prisms and hexahedra into tetrahedra"). A cell is then the cone
-from one of its corners over the faces that do not hold it.
+from one of its corners over the faces without that corner.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from .content import CELLS, Array, Cells, Index, MeshContent
-from .polygons import Wrong, triangulate
+from .polygons import FaultyPolygons, triangulate
 
 __all__ = ["Split", "tets_of", "triangles_of"]
 
 Mask = NDArray[np.bool_]
 
-# Triangles and quads around each cell, corners counter-clockwise seen from outside, in the order of VTK.
+# triangles and quads of each cell, corners counter-clockwise seen from outside, in the order of VTK
 _TRIANGLES: dict[str, list[list[int]]] = {
     "tetra": [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]],
     "pyramid": [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]],
@@ -42,10 +42,10 @@ class Split:
     """Elements of one kind made of the cells of a file.
 
     Args:
-        points: [N, 3] those of the file, and behind them centres of cells that no corner could be the apex of.
+        points: [N, 3] those of the file, followed by centres of cells of which no corner can be the apex.
         elements: point numbers [E, 4] of tets or [E, 3] of triangles, in the order of the file.
-        regions: region number of each element [E], or None where the file has none.
-        notes: what was split or left out, a sentence each.
+        regions: region number of each element [E], or None if the file has none.
+        notes: splits and omissions, a sentence each.
     """
 
     points: Array
@@ -55,7 +55,7 @@ class Split:
 
 
 def tets_of(content: MeshContent) -> Split:
-    """Tets of all cells that have a volume."""
+    """Split all cells that have a volume into tets."""
     solid = [block for block in content.cells if block.kind in _TRIANGLES and len(block)]
     points, elements, owners, folded = content.points, [], [], 0
     made: Counter[str] = Counter()
@@ -69,24 +69,24 @@ def tets_of(content: MeshContent) -> Split:
         elements.append(tets)
         owners.append(cells)
     cells_of = _counts(solid)
-    notes = [*_left_out(content), *_of_higher_order(solid)]
-    notes += [f"{_say(cells_of[kind], kind)} became {count} tets" for kind, count in made.items()]
+    notes = [*_omissions(content), *_of_higher_order(solid)]
+    notes += [f"{_count_words(cells_of[kind], kind)} became {count} tets" for kind, count in made.items()]
     if folded:
         notes.append(f"{folded} of the cells that became tets are folded or flat, and so are some of their tets")
     return Split(points, _joined(elements, 4), _regions(solid, owners), notes)
 
 
 def triangles_of(content: MeshContent) -> Split:
-    """Triangles of all triangles, quads and polygons."""
+    """Split all triangles, quads and polygons into triangles."""
     flat = [block for block in content.cells if block.kind in ("triangle", "quad", "polygon") and len(block)]
-    elements, owners, wrong = [], [], Wrong(0, 0)
+    elements, owners, wrong = [], [], FaultyPolygons(0, 0)
     for block in flat:
         if block.kind == "triangle":
             triangles, cells = block.corners, np.arange(len(block))
         else:
             sizes = np.full(len(block), 4) if block.sizes is None else block.sizes
             triangles, cells, bad = triangulate(content.points, block.corners.reshape(-1), sizes)
-            wrong = Wrong(wrong.small + bad.small, wrong.crossed + bad.crossed)
+            wrong = FaultyPolygons(wrong.small + bad.small, wrong.crossed + bad.crossed)
         elements.append(triangles)
         owners.append(cells)
     notes = _of_higher_order(flat)
@@ -102,7 +102,7 @@ def _joined(elements: list[Index], corners: int) -> Index:
 
 
 def _regions(blocks: list[Cells], owners: list[Index]) -> Index | None:
-    """The region of each element: that of its cell, 0 where a block has none."""
+    """Region of each element: that of its cell, 0 if a block has none."""
     if all(block.regions is None for block in blocks):
         return None
     pairs = zip(blocks, owners, strict=True)
@@ -116,24 +116,24 @@ def _counts(blocks: list[Cells]) -> Counter[str]:
     return counts
 
 
-def _say(count: int, kind: str) -> str:
-    """A number of cells in words."""
+def _count_words(count: int, kind: str) -> str:
+    """Count of cells as words."""
     return f"{count} {kind if count == 1 else _PLURALS.get(kind, f'{kind}s')}"
 
 
 def _of_higher_order(blocks: list[Cells]) -> list[str]:
     counts = _counts([block for block in blocks if block.order > 1])
     straight = "of higher order: corners kept, nodes on edges left out, so that edges are straight"
-    return [f"{_say(count, kind)} {straight}" for kind, count in counts.items()]
+    return [f"{_count_words(count, kind)} {straight}" for kind, count in counts.items()]
 
 
-def _left_out(content: MeshContent) -> list[str]:
-    """Cells of other kinds, and lines and vertices that do not lie on any of the others."""
+def _omissions(content: MeshContent) -> list[str]:
+    """Notes on cells of other kinds, and on lines and vertices that lie on no other cell."""
     known = [block for block in content.cells if block.kind == "polygon" or CELLS.get(block.kind, (0, 0))[1] >= 2]
     used = np.zeros(len(content.points), dtype=bool)
     for block in known:
         used[block.corners] = True
-    # Meshers describe the edges of what they fill as lines and points: these have no part in the volume.
+    # Meshers describe the edges of a volume as lines and points, which are no part of it.
     others = [
         block
         for block in content.cells
@@ -143,13 +143,13 @@ def _left_out(content: MeshContent) -> list[str]:
     ]
     notes = []
     for kind, count in _counts(others).items():
-        volume = sum(_hulls(content.points, block) for block in others if block.kind == kind)
-        notes.append(f"{_say(count, kind)} left out" + (f", {volume:.4g} m^3" if volume else ""))
+        volume = sum(_hull_volume(content.points, block) for block in others if block.kind == kind)
+        notes.append(f"{_count_words(count, kind)} left out" + (f", {volume:.4g} m^3" if volume else ""))
     return notes
 
 
-def _hulls(points: Array, block: Cells) -> float:
-    """The volume of cells of any shape: that of the convex hull of their corners."""
+def _hull_volume(points: Array, block: Cells) -> float:
+    """Volume of the convex hulls of cells of any shape."""
     if block.sizes is None:
         return 0.0
     total = 0.0
@@ -160,9 +160,9 @@ def _hulls(points: Array, block: Cells) -> float:
 
 
 def _choose_diagonals(blocks: list[Cells]) -> list[Index]:
-    """Of each quad face [n, quads], from which of its corners 0 and 1 its diagonal runs.
+    """For each quad face [n, quads], corner 0 or 1 at which its diagonal starts.
 
-    That is the diagonal through its lowest vertex, except where triangles of other cells lie on the face: theirs.
+    The diagonal runs through the lowest vertex, unless triangles of other cells lie on the face: then it is theirs.
     """
     quads = [_faces(block, _QUADS[block.kind], 4) for block in blocks]
     chosen: list[Index] = [np.asarray(quad.argmin(axis=2) % 2, dtype=np.int64) for quad in quads]
@@ -177,7 +177,7 @@ def _choose_diagonals(blocks: list[Cells]) -> list[Index]:
     if not len(triangles):
         return chosen
     halves = [corners[:, cut] for cut in ([0, 1, 2], [0, 2, 3], [1, 2, 3], [1, 3, 0])]
-    met = _among(np.concatenate(halves), triangles).reshape(4, -1)
+    met = _rows_in(np.concatenate(halves), triangles).reshape(4, -1)
     first, second = met[0] | met[1], met[2] | met[3]
     start = 0
     for number, quad in enumerate(quads):
@@ -193,8 +193,8 @@ def _faces(block: Cells, corners: list[list[int]], width: int) -> Index:
     return block.corners[:, np.array(corners, dtype=np.int64).reshape(-1, width)]
 
 
-def _among(some: Index, others: Index) -> Mask:
-    """Which rows of some have the vertices of a row of others, in any order."""
+def _rows_in(some: Index, others: Index) -> Mask:
+    """Mask of the rows of `some` that have the vertices of a row of `others`, in any order."""
     rows = np.sort(np.concatenate([some, others]), axis=1)
     number = np.unique(rows, axis=0, return_inverse=True)[1].reshape(-1)
     there = np.zeros(int(number.max()) + 1, dtype=bool)
@@ -203,10 +203,10 @@ def _among(some: Index, others: Index) -> Mask:
 
 
 def _cones(points: Array, block: Cells, diagonals: Index) -> tuple[Array, Index, Index, int]:
-    """Points, tets, the cell of each, and how many cells have a tet without a positive volume whatever their apex.
+    """Points, tets, the cell of each tet, and the number of cells with a tet of no positive volume for every apex.
 
-    The apex is the corner of the lowest number; where tets would come out inverted, or another diagonal is prescribed,
-    the next corner that will do; or else the centre, which becomes a point.
+    The apex is the corner of the lowest number. If that inverts tets or contradicts a prescribed diagonal, it is the
+    next valid corner, and else the centre, which becomes a point.
     """
     corners, count = block.corners, len(block)
     faces, around = _cut_faces(block, diagonals)
@@ -219,7 +219,7 @@ def _cones(points: Array, block: Cells, diagonals: Index) -> tuple[Array, Index,
     for rank in range(apexes.shape[1]):
         real = _are_tets(apexes[left, rank], faces[left])
         volumes = _volumes(points, places[left, rank], faces[left]) * signs[left, None]
-        # A triangle beside the apex in a face of the apex: the diagonal of this face is the other one.
+        # A triangle next to the apex in a face of the apex means that this face has the other diagonal.
         beside = (around[left] == apexes[left, rank, None, None]).any(axis=2)
         good = (~real | ((volumes > 0) & ~beside)).all(axis=1)
         chosen[left[good]] = rank
@@ -237,7 +237,7 @@ def _cones(points: Array, block: Cells, diagonals: Index) -> tuple[Array, Index,
 
 
 def _cut_faces(block: Cells, diagonals: Index) -> tuple[Index, Index]:
-    """All faces of each cell as triangles [n, faces, 3], and the corners of the face that each is a part of."""
+    """All faces of each cell as triangles [n, faces, 3], and the corners of the source face of each."""
     quads = _faces(block, _QUADS[block.kind], 4)
     cuts = np.array([[[0, 1, 2], [0, 2, 3]], [[1, 2, 3], [1, 3, 0]]])[diagonals]  # [n, quads, 2, 3]
     halves = np.take_along_axis(quads, cuts.reshape(*quads.shape[:2], 6), axis=2).reshape(len(block), -1, 3)
@@ -256,7 +256,7 @@ def _volumes(points: Array, apex: Array, faces: Index) -> Array:
 
 
 def _are_tets(apex: Index, faces: Index) -> Mask:
-    """Which cones have four different corners; in a collapsed cell, triangles may name a vertex twice."""
+    """Mask of cones with four different corners; triangles of a collapsed cell may have a repeated vertex."""
     a, b, c = (faces[..., k] for k in range(3))
     holds = (faces == apex[:, None, None]).any(axis=2)
     return np.asarray(~holds & (a != b) & (b != c) & (c != a))

@@ -1,4 +1,4 @@
-"""Rotations that files name, as matrices that act on columns."""
+"""Rotations in mesh files, as matrices that act on columns."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from .content import Array
 
 __all__ = ["Z_UP", "rotation"]
 
-# From z up to y up: (x, y, z) becomes (x, z, -y).
+# from z up to y up: (x, y, z) becomes (x, z, -y)
 Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def rotation(axis: Array, degrees: float) -> Array:
-    """Rodrigues' formula [3, 3]; the axis need not have length 1, and turns nothing where it has none."""
+    """Rotation matrix [3, 3] by Rodrigues' formula. The axis may have any length; a zero axis gives the identity."""
     x, y, z = np.asarray(axis) / (np.linalg.norm(axis) or 1.0)
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = np.deg2rad(degrees)

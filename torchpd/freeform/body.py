@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.checks import as_array, check_finite, check_positive, check_scalar, check_shape
-from ..geometry.mesh_checks import store
-from ..geometry.tet_mesh import trusted
+from ..geometry.mesh_checks import set_frozen
+from ..geometry.tet_mesh import without_face_checks
 from ..scene.effects import ArrayLike, Solid
 from .constraints import Constraints, prisms, skeleton
 from .surface import PatchPose, PatchSurface
@@ -88,14 +88,16 @@ class PatchBody(Solid):
         own = made.patch >= 0
         st = np.where(own, constants[np.where(own, made.patch, 0)], constants.mean())
         # overlaps and gaps between the constraints of a skeleton are no matter of mass
-        super().__init__(trusted(made.points, made.tets), 2.0 * st, mass / made.share)
+        super().__init__(without_face_checks(made.points, made.tets), 2.0 * st, mass / made.share)
         rest = torch.as_tensor(made.points, dtype=patches.vertices.dtype, device=patches.vertices.device)
-        store(self, patches=patches, apex=apex, apexes=len(made.points) - len(patches.vertices), patch_of=made.patch)
+        set_frozen(
+            self, patches=patches, apex=apex, apexes=len(made.points) - len(patches.vertices), patch_of=made.patch
+        )
         chosen = None if apex == "prism" else torch.as_tensor(made.tets[:count, 3] - len(patches.vertices))
         layer = _Layer(patches.triangles, self.apexes) if apex == "prism" else None
-        store(self, _layer=layer)
+        set_frozen(self, _layer=layer)
         transport = PatchTransport(patches, self._apexes(rest[None])[0], chosen, mode=mode, stretch=stretch)
-        store(self, transport=transport)
+        set_frozen(self, transport=transport)
 
     def pose(self, positions: Tensor, fallback: Tensor | None = None) -> PatchPose:
         """How the patches follow the body, for `patches.surface` and `patches.mesh`. Differentiable.

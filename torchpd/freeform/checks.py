@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..geometry.mesh_checks import check_elements, check_points, compact, has_repeated_corner, refuse
+from ..geometry.mesh_checks import check_elements, check_points, compact, has_repeated_corner, raise_for_first
 
 __all__ = ["angle_weighted_normals", "check_surface"]
 
@@ -21,7 +21,7 @@ def check_surface(vertices: Tensor, triangles: Tensor) -> Index:
     name = "FreeFormPatches.triangles"
     points = check_points("FreeFormPatches.vertices", vertices)
     elements = check_elements(name, triangles, 3, len(points))
-    refuse(name, has_repeated_corner(elements), elements, "corners must differ", "leave them out")
+    raise_for_first(name, has_repeated_corner(elements), elements, "corners must differ", "leave them out")
     corners = points[elements]
     sides = corners[:, [1, 2, 0]] - corners
     area2 = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
@@ -29,7 +29,7 @@ def check_surface(vertices: Tensor, triangles: Tensor) -> Index:
     longest = np.linalg.norm(sides, axis=2).max(axis=1)
     precision = float(torch.finfo(vertices.dtype).eps)
     noise = precision * (np.abs(points).max() + 2.0 * longest) * longest
-    refuse(name, ~(area2 > noise), elements, "areas must not vanish", "leave them out or weld their corners")
+    raise_for_first(name, ~(area2 > noise), elements, "areas must not vanish", "leave them out or weld their corners")
     _check_edges(name, elements)
     compact("FreeFormPatches", elements, len(points), drop=False)
     return elements

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..common.checks import check_scalar
 from ..common.reprs import by_sizes
-from ..geometry.mesh_checks import store
+from ..geometry.mesh_checks import set_frozen
 from ..geometry.tri_mesh import TriMesh
 from . import ops as patch_ops  # noqa: F401  (registers the ops)
 from .adjacency import Touching, gather_lists, touching
@@ -109,7 +109,7 @@ class PatchSurface:
         if quadrics is None:
             quadrics = Quadrics.none(vertices.dtype, vertices.device)
         _check_directors(directors, vertices)
-        store(
+        set_frozen(
             self,
             vertices=vertices,
             triangles=torch.as_tensor(elements, dtype=torch.int32, device=vertices.device),
@@ -129,7 +129,7 @@ class PatchSurface:
         elements = self.triangles.cpu().numpy().astype(np.int64)
         arrays = gather_lists(elements, len(self.vertices), pairs, len(quadrics))
         device, dtype = self.vertices.device, self.vertices.dtype
-        store(
+        set_frozen(
             self,
             quadrics=quadrics,
             lists=tuple(torch.as_tensor(a, dtype=torch.int32, device=device).contiguous() for a in arrays),
@@ -175,7 +175,7 @@ class PatchSurface:
             raise ValueError(
                 f"with_quadrics: keep_lists needs {len(self.quadrics)} quadrics as before, got {len(quadrics)}"
             )
-        store(other, quadrics=quadrics)
+        set_frozen(other, quadrics=quadrics)
         return other
 
     def with_shape(self, vertices: Tensor, directors: Tensor) -> Self:
@@ -186,7 +186,7 @@ class PatchSurface:
         check_real_tensor("with_shape: vertices", vertices, tuple(self.vertices.shape), "positions at rest [m]")
         check_real_tensor("with_shape: directors", directors, tuple(self.directors.shape), "unit vectors")
         other = self._copy()
-        store(other, vertices=vertices, directors=directors)
+        set_frozen(other, vertices=vertices, directors=directors)
         return other
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
@@ -196,7 +196,7 @@ class PatchSurface:
             name: getattr(self, name).to(*args, **kwargs) for name in ("vertices", "directors", "reach", "steepness")
         }
         device = real["vertices"].device
-        store(
+        set_frozen(
             other,
             **real,
             quadrics=self.quadrics.to(*args, **kwargs),

@@ -1,11 +1,11 @@
-"""The body-centred cubic lattice of tetrahedra: which of its tets a surface touches, and which it encloses.
+"""The body-centred cubic lattice of tetrahedra: its tets that a surface touches, and those that it encloses.
 
 Every tet joins the centres of two neighbouring cubes to one edge of the square between them. All tets are congruent,
 with dihedral angles of 60 and 90 degrees (a cube cut into six has 45), and have no preferred diagonal.
 
-Lengths here are in cubes: cube (i, j, k) fills [i, i + 1] x [j, j + 1] x [k, k + 1]. Corner positions are kept in half
-cubes, as integers: even for cube corners, odd for cube centres. A tet is (axis, i, j, k, edge): it lies across the
-square between cube (i, j, k) and the next cube along `axis`, over the edge number `edge` of that square.
+Lengths here are in cubes: cube (i, j, k) fills [i, i + 1] x [j, j + 1] x [k, k + 1]. Corner positions are integers in
+half cubes: even for cube corners, odd for cube centres. A tet is (axis, i, j, k, edge): it lies across the square
+between cube (i, j, k) and the next cube along `axis`, over the edge number `edge` of that square.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# Counts as touching, in cubes: far above rounding (1e-13 for 1000 cubes), far below anything that can be seen.
+# Touching distance in cubes: far above rounding (1e-13 for 1000 cubes), far below any visible length.
 _TOUCH = 1e-9
-# How far to look for other tets around a point, in cubes: beyond what counts as touching, far below a tet.
+# Distance in cubes to look for other tets around a point: above the touching distance, far below a tet.
 _NUDGE = 1e-6
-# Triangle-tet pairs tested at a time, to bound memory.
+# triangle-tet pairs tested at a time, to bound memory
 _CHUNK = 200_000
 
 
@@ -39,7 +39,7 @@ def _axes(axis: int, edge: int) -> tuple[int, int]:
 
 
 def _edge(axis: int, side_axis: int, side: int) -> int:
-    """The number of the edge that lies on `side` (0 low, 1 high) of `side_axis` in the square across `axis`."""
+    """Number of the edge on `side` (0 low, 1 high) of `side_axis` in the square across `axis`."""
     return (0 if side_axis == (axis + 1) % 3 else 2) + side
 
 
@@ -61,12 +61,12 @@ def _corner_table() -> NDArray[np.int64]:
 
 
 _CORNERS = _corner_table()
-# From every corner of every kind of tet to its middle: one direction into each tet around a vertex.
+# from every corner of every kind of tet to its centroid: one direction into each tet around a vertex
 _AROUND = 0.5 * (_CORNERS.mean(axis=2, keepdims=True) - _CORNERS).reshape(-1, 3)
 
 
 def _apart(ours: Array, theirs: Array, axes: Array, slack: float) -> Mask:
-    """Whether the projections [P, axes, points] of two bodies lie apart by `slack` along any axis [..., axes, 3]."""
+    """Whether projections [P, axes, points] of two bodies are separated by `slack` along any axis [..., axes, 3]."""
     margin = slack * np.linalg.norm(axes, axis=-1)
     after = ours.min(axis=-1) > theirs.max(axis=-1) + margin
     before = theirs.min(axis=-1) > ours.max(axis=-1) + margin
@@ -74,13 +74,13 @@ def _apart(ours: Array, theirs: Array, axes: Array, slack: float) -> Mask:
 
 
 def _overlaps(triangles: Array, tet: Array, slack: float = _TOUCH) -> Mask:
-    """Whether closed triangles [P, 3, 3] and one closed tet [4, 3] meet: the separating axis theorem, all 23 axes.
+    """Whether closed triangles [P, 3, 3] and one closed tet [4, 3] meet: separating axis theorem, all 23 axes.
 
-    With a negative slack: whether triangles enter the tet by that much, and do not only touch it.
+    A negative slack demands that triangles enter the tet by that much, instead of touching it.
 
-    Two convex polyhedra are apart exactly when they are apart along a face normal of one of them or along the cross
-    product of an edge of each. A vanishing axis (a triangle without area) never separates: at worst a tet too many.
-    The axes of the tet are tried first, because they are fixed and settle most pairs.
+    Two convex polyhedra are separated exactly if a face normal of one of them separates them, or the cross product of
+    an edge of each. A vanishing axis (a triangle without area) never separates: at worst a tet too many. The axes of
+    the tet are tried first, because they are fixed and settle most pairs.
     """
     spans = tet[[1, 2, 3, 2, 3, 3]] - tet[[0, 0, 0, 1, 1, 2]]
     faces = np.cross(spans[[0, 1, 2, 3]], spans[[1, 2, 0, 4]])
@@ -94,9 +94,9 @@ def _overlaps(triangles: Array, tet: Array, slack: float = _TOUCH) -> Mask:
 
 
 def split_long(triangles: Array) -> tuple[Array, Index]:
-    """The same surface in triangles whose edges are at most one cube long, and of which triangle each is a part.
+    """Split triangles until no edge exceeds one cube; returns them and the source triangle of each.
 
-    Halves longest edges. An edge of two triangles is cut alike in both, so that what is closed stays so, to the bit.
+    Halves longest edges. Both triangles of an edge cut it alike, so that a closed surface stays closed, to the bit.
     """
     done, parents = [triangles[:0]], [np.arange(0)]
     source = np.arange(len(triangles))
@@ -106,7 +106,7 @@ def split_long(triangles: Array) -> tuple[Array, Index]:
         done.append(triangles[~long])
         parents.append(source[~long])
         triangles, lengths, source = triangles[long], lengths[long], np.tile(source[long], 2)
-        # Turn each triangle so that its longest edge comes first, then cut that edge in the middle.
+        # Rotate each triangle so that its longest edge comes first, then halve that edge.
         turn = (np.argmax(lengths, axis=1)[:, None] + np.arange(3)) % 3
         a, b, c = np.moveaxis(np.take_along_axis(triangles, turn[:, :, None], axis=1), 1, 0)
         middle = 0.5 * (a + b)
@@ -130,10 +130,10 @@ def candidates(low: Array, high: Array, shape: tuple[int, ...]) -> tuple[Index, 
 
 
 def _neighbours(ids: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """The tets on both sides of every inner face, from the tet numbers [axis, i, j, k, edge].
+    """Tets on both sides of every inner face, from the tet numbers [axis, i, j, k, edge].
 
     A tet meets two others over the same square, and one in each of its two cubes: around a cube edge, the squares of
-    two axes meet. The outermost layer of cubes is left out.
+    two axes meet. The outermost layer of cubes is excluded.
     """
     first, second = [], []
     for low in (0, 1):
@@ -157,7 +157,7 @@ def _neighbours(ids: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.i
 
 @dataclass(frozen=True)
 class Lattice:
-    """A box of cubes in space. Two layers of cubes around what is to be enclosed must be left free."""
+    """A box of cubes in space, with two empty layers of cubes around the enclosed surface."""
 
     origin: Array  # lower corner of cube (0, 0, 0) [m]
     spacing: float  # edge of a cube [m]
@@ -165,10 +165,10 @@ class Lattice:
 
     @classmethod
     def around(cls, low: Array, high: Array, cells: int) -> Lattice:
-        """Cubes centred on a box: `cells` along its longest side, and two more on every side."""
+        """Lattice centred on a box, with `cells` along its longest side and two more on every side."""
         extent = high - low
         spacing = float(extent.max()) / cells
-        # A side that is a whole number of cubes long up to rounding does not get another one.
+        # a side of a whole number of cubes up to rounding gets no further cube
         counts = np.maximum(np.ceil(extent / spacing - 1e-6), 1).astype(int) + 4
         if 24 * int(np.prod(counts)) >= 2**31:
             raise ValueError(
@@ -182,11 +182,11 @@ class Lattice:
         return (3, *self.shape, 4)
 
     def coordinates(self, points: Array) -> Array:
-        """Positions in cubes."""
+        """Convert positions [m] to cubes."""
         return (points - self.origin) / self.spacing
 
     def all_tets(self) -> Index:
-        """The numbers of all tets of the lattice."""
+        """Numbers of all tets of the lattice."""
         exists = np.ones(self._tet_shape(), dtype=bool)
         exists[0, -1] = exists[1, :, -1] = exists[2, :, :, -1] = False
         return np.flatnonzero(exists)
@@ -202,16 +202,16 @@ class Lattice:
         return self.origin + 0.5 * self.spacing * halves, numbers.reshape(-1, 4).astype(np.int64)
 
     def touched(self, triangles: Array, report: Callable[[Iterable[int]], Iterable[int]] = iter) -> Mask:
-        """Which tets [axis, i, j, k, edge] meet any of the triangles [T, 3, 3] (in m)."""
+        """Mask of tets [axis, i, j, k, edge] that meet any of the triangles [T, 3, 3] (in m)."""
         pieces, _ = split_long(self.coordinates(triangles))
         touched = np.zeros(self._tet_shape(), dtype=bool)
-        # The tets around corners and centres of the pieces are touched for certain; the others have to be tested.
+        # The tets around corners and centroids of the pieces certainly touch; the others are tested.
         samples = np.concatenate([*np.moveaxis(pieces, 1, 0), pieces.mean(axis=1)])
         touched.reshape(-1)[self._locate(samples)[0]] = True
         return touched | self._meeting(pieces, ~touched, _TOUCH, report)
 
     def entered(self, triangles: Array, asked: Mask) -> Mask:
-        """Which of the tets in question the triangles [T, 3, 3] (in m) reach into: touching alone does not count."""
+        """Mask of tets in `asked` that the triangles [T, 3, 3] (in m) enter; touching does not count."""
         if not asked.any():
             return np.zeros_like(asked)
         return self._meeting(split_long(self.coordinates(triangles))[0], asked, -_TOUCH, iter)
@@ -219,7 +219,7 @@ class Lattice:
     def _meeting(
         self, pieces: Array, asked: Mask, slack: float, report: Callable[[Iterable[int]], Iterable[int]]
     ) -> Mask:
-        """Which of the tets in question meet any of the small triangles (in cubes)."""
+        """Mask of tets in `asked` that meet any of the small triangles (in cubes)."""
         low, high = pieces.min(axis=1) - _TOUCH, pieces.max(axis=1) + _TOUCH
         found = np.zeros_like(asked)
         for kind in report(range(12)):
@@ -236,7 +236,7 @@ class Lattice:
         return found
 
     def enclosed(self, walls: Mask) -> Mask:
-        """Which tets cannot be reached from outside through faces between tets that are no walls."""
+        """Mask of tets that no path from outside reaches through faces between tets other than `walls`."""
         count = walls.size
         first, second = _neighbours(np.arange(count, dtype=np.int32).reshape(walls.shape))
         free = ~walls.reshape(-1)
@@ -246,19 +246,19 @@ class Lattice:
         region = connected_components(graph, directed=False)[1].reshape(walls.shape)
         inside = np.zeros(int(region.max()) + 1, dtype=bool)
         inside[region[:, 1:-2, 1:-2, 1:-2]] = True
-        for axis in range(1, 4):  # tets of the outermost cubes, which the graph leaves out, are outside
+        for axis in range(1, 4):  # tets of the outermost cubes, which the graph excludes, are outside
             for layer in (0, -2, -1):
                 inside[np.take(region, layer, axis=axis)] = False
         return np.asarray(inside[region] & ~walls)
 
     def locate(self, points: Array) -> tuple[Index, Array]:
-        """The number of the tet around each point (in m), and its barycentric coordinates [n, 4], none negative."""
+        """Number of the tet around each point (in m), and its barycentric coordinates [n, 4], none negative."""
         return self._locate(self.coordinates(points))
 
     def locate_among(self, points: Array, kept: Mask) -> tuple[Index, Array]:
-        """As `locate`, but points on a face, an edge or a vertex of several tets get one that is kept, if there is one.
+        """As `locate`, but a point on a face, edge or vertex gets one of its tets in `kept`, if there is one.
 
-        Weights may be negative by rounding then.
+        Rounding may then make weights negative.
         """
         place = self.coordinates(points)
         numbers, weights = self._locate(place)
@@ -283,7 +283,7 @@ class Lattice:
     def _locate(self, place: Array) -> tuple[Index, Array]:
         """Tets and barycentric coordinates of points in cubes.
 
-        With q the position from the centre of the point's cube, and |q_a| >= |q_b| >= |q_c|, the tet lies across the
+        Let q be the position from the centre of the point's cube, and |q_a| >= |q_b| >= |q_c|. The tet lies across the
         square on the side of q_a, over the edge on the side of q_b. Its weights are 1 - |q_a| - |q_b| at that centre,
         |q_a| - |q_b| at the next one, and |q_b| -+ q_c at the ends of the edge along c: none is negative.
         """
@@ -296,7 +296,7 @@ class Lattice:
         weights = np.stack([1 - np.abs(qa) - np.abs(qb), np.abs(qa) - np.abs(qb), np.abs(qb) - qc, np.abs(qb) + qc], 1)
         cube[rows, axis] -= qa < 0
         edge = np.where(side_axis == (axis + 1) % 3, 0, 2) + (qb > 0)
-        # Put the weights in the order of the tet's corners: low centre first, ends of the edge as the table has them.
+        # Order the weights as the corners of the tet: low centre first, ends of the edge as in the table.
         swapped = np.where((qa < 0)[:, None], weights[:, [1, 0, 2, 3]], weights)
         ends = _CORNERS[axis, edge][rows, 2:, along]
         weights = np.where((ends[:, 0] > ends[:, 1])[:, None], swapped[:, [0, 1, 3, 2]], swapped)

@@ -1,8 +1,8 @@
-"""Fewer triangles for a surface, as few as patches need for a base.
+"""Surface simplification, down to the base mesh of freeform patches.
 
-Edges are contracted in the order of their quadric error (Garland and Heckbert, 1997), as long as the surface keeps its
-topology and no triangle turns over: what results can carry patches whenever the original could. fast-simplification
-is a hundred times faster, but of the octopus at 80 triangles it leaves an edge that more than two have in common.
+Edges are contracted in the order of their quadric error (Garland and Heckbert, 1997), while the topology stays and no
+triangle flips. So the result can carry patches whenever the original could. fast-simplification is a hundred times
+faster, but of the octopus at 80 triangles it leaves a non-manifold edge.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ __all__ = ["simplify"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Weights of the squared distances from the planes of boundary edges, and from the vertices themselves, beside the one
-# from the planes of triangles. The latter keeps triangles even where the surface is flat.
+# Weights of the squared distances from boundary planes and from the vertices, relative to triangle planes. The latter
+# keeps triangles even on flat surfaces.
 _BOUNDARY, _PLACE = 10.0, 3e-3
 _LEAST_TURN = 0.2  # cosine between the old and the new normal of a triangle
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
@@ -29,7 +29,7 @@ _LEAST_SHAPE = 0.05  # twice the area over the longest edge squared: 0.87 for an
 
 
 def _plane_quadrics(normals: Array, points: Array, weights: Array) -> Array:
-    """Squared distances from planes as forms [N, 4, 4] of (x, 1)."""
+    """Squared distances from planes as quadratic forms [N, 4, 4] of (x, 1)."""
     plane = np.concatenate([normals, -(normals * points).sum(axis=1, keepdims=True)], axis=1)
     return np.asarray(weights[:, None, None] * plane[:, :, None] * plane[:, None, :])
 
@@ -61,12 +61,12 @@ def _vertex_quadrics(vertices: Array, triangles: Index) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """`np.cross` of [N, 3], many times faster for few."""
+    """`np.cross` of [N, 3], many times faster for small N."""
     return np.asarray(a[:, _NEXT] * b[:, _LAST] - a[:, _LAST] * b[:, _NEXT])
 
 
 class _Surface:
-    """Triangles around each vertex, and a heap of the edges that may be contracted."""
+    """Triangles around each vertex, and a heap of candidate edges."""
 
     def __init__(self, mesh: TriMesh) -> None:
         self.vertices = mesh.vertices.copy()
@@ -78,12 +78,12 @@ class _Surface:
         for number, corners in enumerate(self.triangles.tolist()):
             for corner in corners:
                 self.around[corner].add(number)
-        # no two are of the same vertices and versions: places are not compared
+        # no two entries have the same vertices and versions: positions are never compared
         self.heap: list[tuple[float, int, int, int, int, Array]] = []
-        self.offer(np.unique(np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
+        self.push(np.unique(np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
 
-    def offer(self, pairs: Index) -> None:
-        """Edges [N, 2] at what the sum of both quadrics is least, and where that is."""
+    def push(self, pairs: Index) -> None:
+        """Push edges [N, 2] with the minimum of the summed quadrics, and its position."""
         forms = self.quadrics[pairs[:, 0]] + self.quadrics[pairs[:, 1]]
         places = np.linalg.solve(forms[:, :3, :3], -forms[:, :3, 3:])[..., 0]
         for (u, v), form, x in zip(pairs.tolist(), forms, places, strict=True):
@@ -94,7 +94,7 @@ class _Surface:
         return {corner for face in self.around[u] for corner in self.triangles[face].tolist()} - {u}
 
     def keeps_topology(self, u: int, v: int) -> bool:
-        """The link condition of Dey et al. (1999), for surfaces with and without a boundary."""
+        """Link condition of Dey et al. (1999), for surfaces with and without a boundary."""
         wings = self.around[u] & self.around[v]
         common = self.neighbours(u) & self.neighbours(v)
         if len(common) != len(wings):
@@ -105,7 +105,7 @@ class _Surface:
         return all(len(self.around[w]) > (3 if len(wings) == 2 else 1) for w in common)
 
     def keeps_shape(self, u: int, v: int, x: Array) -> bool:
-        """No triangle that stays turns over or becomes a sliver."""
+        """Whether no remaining triangle flips or becomes a sliver."""
         staying = np.array(sorted(self.around[u] ^ self.around[v]), dtype=np.int64)
         if not len(staying):
             return False
@@ -121,7 +121,7 @@ class _Surface:
         return bool(np.all(turned & (size > _LEAST_SHAPE * longest2)))
 
     def contract(self, u: int, v: int, x: Array) -> int:
-        """Move u to x and let v become u; how many triangles that took away."""
+        """Move u to x and merge v into u; returns the number of triangles removed."""
         wings = self.around[u] & self.around[v]
         for face in wings:
             self.alive[face] = False
@@ -135,19 +135,19 @@ class _Surface:
         self.quadrics[u] += self.quadrics[v]
         self.version[u] += 1
         self.version[v] += 1
-        self.offer(np.array([(min(u, w), max(u, w)) for w in sorted(self.neighbours(u))]).reshape(-1, 2))
+        self.push(np.array([(min(u, w), max(u, w)) for w in sorted(self.neighbours(u))]).reshape(-1, 2))
         return len(wings)
 
 
 def simplify(mesh: TriMesh, triangles: int) -> TriMesh:
-    """A surface of about as many triangles as asked for, never more.
+    """Simplify a surface to at most the given number of triangles, and about as many.
 
     Args:
         mesh: oriented, each edge in at most two triangles.
-        triangles: at most so many, at least 4.
+        triangles: upper bound, at least 4.
 
     Raises:
-        ValueError: the topology or the shape of the surface does not allow so few.
+        ValueError: topology or shape of the surface does not allow so few.
     """
     most = int(check_scalar("simplify: triangles", triangles, minimum=4))
     surface = _Surface(mesh)
@@ -160,7 +160,7 @@ def simplify(mesh: TriMesh, triangles: int) -> TriMesh:
             left -= surface.contract(u, v, x)
     if left > most:
         raise ValueError(
-            f"simplify: {most} triangles must be enough for the topology and shape of the surface, got stuck at {left} "
+            f"simplify: {most} triangles must be enough for the topology and shape of the surface, reached {left} "
             f"of {len(mesh.triangles)}; ask for more, or make a coarse mesh by other means"
         )
     used, numbers = np.unique(surface.triangles[surface.alive], return_inverse=True)

@@ -1,4 +1,4 @@
-"""A surface that rides in a tetrahedral mesh: every surface vertex is a fixed combination of one tet's corners."""
+"""A surface embedded in a tetrahedral mesh: each surface vertex is a fixed combination of the corners of one tet."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ __all__ = ["Embedding", "embed_surface", "embed_triangles"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# How many of the nearest tets compete for a point that lies in none.
+# number of nearest tets compared for a point outside of all
 _NEAREST = 32
-# Points in work at a time, to bound memory.
+# points processed at a time, to bound memory
 _CHUNK = 100_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Embedding:
-    """Carries a surface with a tetrahedral mesh: surface vertex i is sum_a weights[i, a] x[corners[i, a]].
+    """Embedding of a surface: surface vertex i is sum_a weights[i, a] x[corners[i, a]].
 
-    Weights add up to 1, so every affine motion of the mesh is carried exactly.
+    Weights add up to 1, so every affine motion of the mesh is reproduced exactly.
     """
 
-    surface: TriMesh  # the surface at rest: its triangles and texture coordinates stay valid for `apply`
-    tets: Index  # [n] the tet that carries each surface vertex
-    weights: Array  # [n, 4] barycentric; not negative where the vertex lies inside its tet
-    corners: Index  # [n, 4] rows `tets` of the mesh: the vertices that the weights belong to
-    vertex_count: int  # vertices of the mesh
+    surface: TriMesh  # surface at rest; its triangles and texture coordinates stay valid for `apply`
+    tets: Index  # tet of each surface vertex [n]
+    weights: Array  # barycentric coordinates [n, 4], not negative inside the tet
+    corners: Index  # rows `tets` of the mesh [n, 4]: the vertices of the weights
+    vertex_count: int  # number of mesh vertices
 
     def __post_init__(self) -> None:
         count = len(self.surface.vertices)
@@ -58,7 +58,7 @@ class Embedding:
     def apply(self, positions: NDArray[Any] | torch.Tensor) -> NDArray[Any] | torch.Tensor:
         """Positions of the surface vertices [..., n, 3] for mesh positions [..., V, 3].
 
-        Arrays and tensors keep their precision; tensors keep their device and are differentiated through.
+        Arrays and tensors keep their precision; tensors keep their device and are differentiable.
         """
         if not isinstance(positions, (np.ndarray, torch.Tensor)):
             raise TypeError(f"Embedding.apply: positions must be a tensor or an array, got {type(positions).__name__}")
@@ -85,7 +85,7 @@ class Embedding:
         return carried
 
     def transformed(self, matrix: Any, corners: Sequence[int] = (0, 1, 2, 3)) -> Embedding:
-        """The embedding in the transformed mesh, whose tets list their corners in another order."""
+        """Embedding in the transformed mesh, whose tets list their corners in another order."""
         order = list(corners)
         return Embedding(
             surface=self.surface.transformed(matrix),
@@ -96,7 +96,7 @@ class Embedding:
         )
 
     def renumbered(self, tets: Index, vertex_count: int) -> Embedding:
-        """The embedding in a mesh of the same tets [E, 4], with other vertex numbers."""
+        """Embedding in a mesh of the same tets [E, 4] with other vertex numbers."""
         return Embedding(self.surface, self.tets, self.weights, tets[self.tets], vertex_count)
 
     def __repr__(self) -> str:
@@ -111,22 +111,22 @@ def _weights(points: Array, origins: Array, gradients: Array) -> Array:
 
 
 def embed_surface(surface: TriMesh, vertices: Array, tets: Index) -> Embedding:
-    """`embed` for a mesh of vertices [V, 3] and tets [E, 4]."""
+    """Embed a surface in a mesh of vertices [V, 3] and tets [E, 4], see `embed`."""
     points, corners = surface.vertices, vertices[tets]
     gradients, _ = shape_gradients(vertices, tets)
     centres = corners.mean(axis=1)
     radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1)
-    # A tet contains only points of the ball around its centre through its farthest corner (widened for rounding).
+    # A tet lies in the ball around its centre through its farthest corner (widened for rounding).
     found = cKDTree(points).query_ball_point(centres, radii * (1.0 + 1e-9))
     sizes = np.fromiter(map(len, found), dtype=np.int64, count=len(found))
     which = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(sizes.sum()))
     carriers = np.repeat(np.arange(len(centres)), sizes)
-    # Points outside of every tet compete among their nearest tets.
+    # Points outside of all tets are compared with their nearest tets.
     near = cKDTree(centres).query(points, k=min(_NEAREST, len(centres)))[1].reshape(len(points), -1)
     which = np.concatenate([which, np.repeat(np.arange(len(points)), near.shape[1])])
     carriers = np.concatenate([carriers, near.reshape(-1)])
-    # The signed distance to the plane of face a is w_a / |grad N_a|. A tet contains the point where the least over a is
-    # not negative, and else is at least as far away as that.
+    # The signed distance to the plane of face a is w_a / |grad N_a|. The tet contains the point if the least over a is
+    # not negative. Otherwise the tet is at least that far away.
     weights = _weights(points[which], corners[carriers, 0], gradients[carriers])
     depth = (weights / np.linalg.norm(gradients[carriers], axis=2)).min(axis=1)
     distance = _distances(points, which, corners, carriers, weights, depth)
@@ -138,7 +138,7 @@ def embed_surface(surface: TriMesh, vertices: Array, tets: Index) -> Embedding:
 
 
 def _distances(points: Array, which: Index, corners: Array, tets: Index, weights: Array, depth: Array) -> Array:
-    """Distance [P] of points `which` to `tets`, 0 inside; inf where another tet is sure to be nearer to the point."""
+    """Distance [P] of points `which` to `tets`, 0 inside; inf if another tet is certainly nearer to the point."""
     inside = np.clip(weights, 0.0, None)
     inside /= inside.sum(axis=1, keepdims=True)
     most = np.linalg.norm(points[which] - np.einsum("pa,pak->pk", inside, corners[tets]), axis=1)
@@ -153,7 +153,7 @@ def _distances(points: Array, which: Index, corners: Array, tets: Index, weights
 
 
 def _outside(points: Array, corners: Array) -> Array:
-    """Distance of points [P, 3] to the surfaces of tets [P, 4, 3]: to an edge, or to a face straight below."""
+    """Distance of points [P, 3] to the surfaces of tets [P, 4, 3]: to an edge, or to a face along its normal."""
     distance = np.full(len(points), np.inf)
     for a, b in combinations(range(4), 2):
         edge, away = corners[:, b] - corners[:, a], points - corners[:, a]
@@ -175,21 +175,21 @@ def _dot(one: Array, other: Array) -> Array:
 
 
 def _report_far(corners: Array, distance: Array) -> None:
-    """Warn of surface vertices that lie farther outside of their tets [n, 4, 3] than these are long."""
+    """Warn of surface vertices farther outside of their tets [n, 4, 3] than these are long."""
     ends = np.array(list(combinations(range(4), 2)))
     cells = distance / np.linalg.norm(corners[:, ends[:, 0]] - corners[:, ends[:, 1]], axis=2).max(axis=1)
     far = int((cells > 1.0).sum())
     if far:
         worst = int(cells.argmax())
         warn(
-            f"embed: {far} of {len(cells)} surface vertices lie farther outside of the mesh than a cell is long, up to "
+            f"embed: {far} of {len(cells)} surface vertices lie more than a cell outside of the mesh, up to "
             f"{cells[worst]:.3g} cells ({distance[worst]:.3g} m): their motion is extrapolated. Move or scale the "
-            "surface onto the mesh, surface.transformed(matrix), or use a mesh that reaches around it"
+            "surface onto the mesh, surface.transformed(matrix), or use a mesh that encloses it"
         )
 
 
 def embed_triangles(vertices: Array, tets: Index, triangles: Index) -> Embedding:
-    """A surface of mesh vertices, given by their numbers [T, 3]: each has weight 1 at that vertex, in its first tet."""
+    """Surface of mesh vertices, by their numbers [T, 3]: each has weight 1 at its vertex, in its first tet."""
     used, numbers = np.unique(triangles, return_inverse=True)
     surface = TriMesh(vertices[used], numbers.reshape(-1, 3))
     carriers, corner = np.divmod(np.unique(tets.reshape(-1), return_index=True)[1][used], 4)

@@ -1,8 +1,8 @@
-"""The surface where a smooth function vanishes, as a closed mesh of even triangles.
+"""Zero surface of a smooth function, as a closed mesh of even triangles.
 
-Marching tetrahedra, then smoothing. Inside is where the function is negative. The body-centred lattice makes it
-simple: in one tet the surface is a triangle or a quadrilateral, without ambiguous cases, and it closes across tets.
-After the same smoothing, marching cubes (scikit-image) leave angles of 10 degrees in the octopus, these tets 23.
+Marching tetrahedra, then smoothing. The function is negative inside. In one tet of the body-centred lattice the surface
+is a triangle or a quadrilateral, without ambiguous cases, and it closes across tets. After the same smoothing, marching
+cubes (scikit-image) leave angles of 10 degrees in the octopus, these tets 23.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Field = Callable[[Array], Array]
 
-# Even permutations (a, b, c, d) of the corners, one for each pair {a, b}: with a and b inside and c and d outside, the
+# Even permutations (a, b, c, d) of the corners, one for each pair {a, b}. With a and b inside and c and d outside, the
 # quadrilateral through the edges ac, ad, bd, bc faces outwards.
 _PAIRS = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 2, 0), (2, 3, 0, 1))
 
 
 def _cut(tets: Index, inside: NDArray[np.bool_]) -> Index:
-    """Triangles [T, 3, 2] of the surface; each corner lies on the lattice edge between two vertices."""
+    """Triangles [T, 3, 2] of the surface; each corner is the pair of vertices of a lattice edge."""
     pieces = []
 
     def add(chosen: NDArray[np.bool_], *edges: tuple[int, int]) -> None:
@@ -48,14 +48,14 @@ def _cut(tets: Index, inside: NDArray[np.bool_]) -> Index:
 
 
 def _neighbour_means(triangles: Index, count: int) -> csr_array:
-    """The matrix that replaces each vertex by the mean of its neighbours on a closed surface."""
+    """Matrix that replaces each vertex of a closed surface by the mean of its neighbours."""
     rows, columns = triangles.reshape(-1), triangles[:, [1, 2, 0]].reshape(-1)
     links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count)).tocsr()
     return csr_array(links.multiply(1.0 / links.sum(axis=1)[:, None]))
 
 
 def _project(field: Field, points: Array, step: float) -> Array:
-    """One Newton step onto the surface along the gradient (by differences), no longer than `step`."""
+    """One Newton step onto the surface along the gradient (finite differences), no longer than `step`."""
     values = field(points)
     shift = 1e-4 * step
     gradient = np.stack([(field(points + shift * axis) - values) / shift for axis in np.eye(3)], axis=1)
@@ -65,13 +65,14 @@ def _project(field: Field, points: Array, step: float) -> Array:
 
 
 def contour(field: Field, low: Array, high: Array, cells: int, rounds: int = 8) -> TriMesh:
-    """The zero surface of `field` (positions [n, 3] to values [n]) inside a box, which it must not leave.
+    """Zero surface of `field` (positions [n, 3] to values [n]) inside a box, whose faces it must not reach.
 
     Args:
         field: negative inside.
         low, high: corners of the box [m].
         cells: lattice cells along its longest side; triangles have edges of about 0.6 cells.
-        rounds: of smoothing; each moves vertices half way to the mean of their neighbours and back onto the surface.
+        rounds: smoothing rounds; each moves vertices half way to the mean of their neighbours and back onto the
+            surface.
     """
     lattice = Lattice.around(low, high, cells)
     vertices, tets = lattice.mesh(lattice.all_tets())

@@ -1,4 +1,4 @@
-"""What a mesh must fulfil, checked once on its way in, and the repairs that are offered."""
+"""Checks of mesh arrays on creation, and the repairs on offer."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ __all__ = [
     "compact",
     "corner_words",
     "determinants",
-    "find_repeated",
+    "find_duplicates",
     "has_repeated_corner",
     "is_flat",
-    "refuse",
+    "raise_for_first",
     "scaling",
-    "store",
+    "set_frozen",
     "translation",
     "warn",
 ]
@@ -43,15 +43,15 @@ _ROUNDOFF = float(np.finfo(np.float64).eps) / 2
 
 
 class MeshWarning(UserWarning):
-    """A mesh was repaired on its way in, or is hardly what was meant; the message says what, how often, and the fix."""
+    """A mesh was repaired on creation, or is unlikely to be intended; the message gives fault, count and fix."""
 
 
 def warn(message: str) -> None:
     warn_user(message, MeshWarning)
 
 
-def store(part: object, **values: Any) -> None:
-    """Set fields of a frozen value; arrays become read-only."""
+def set_frozen(part: object, **values: Any) -> None:
+    """Set fields of a frozen object; arrays become read-only."""
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             value = np.ascontiguousarray(value)
@@ -60,7 +60,7 @@ def store(part: object, **values: Any) -> None:
 
 
 def check_points(name: str, value: Numbers) -> Array:
-    """Vertices as float64 [V, 3]."""
+    """Check vertices; returns them as float64 [V, 3]."""
     array = as_array(name, value)
     if array.size == 0:
         raise ValueError(f"{name} must hold at least one vertex, got none")
@@ -72,7 +72,7 @@ def check_points(name: str, value: Numbers) -> Array:
 
 
 def check_elements(name: str, value: Numbers, corners: int, count: int) -> Index:
-    """Corner numbers as int64 [E, corners], each an existing vertex."""
+    """Check that corner numbers name vertices; returns them as int64 [E, corners]."""
     array = as_array(name, value)
     if array.size == 0:
         raise ValueError(f"{name} must hold at least one element, got none")
@@ -98,15 +98,15 @@ def has_repeated_corner(elements: Index) -> NDArray[np.bool_]:
 
 
 def corner_words(elements: Index) -> NDArray[np.uint64]:
-    """A random word for each vertex, at every corner [E, corners]: sums of them are equal where corners are."""
+    """Random word of the vertex at every corner [E, corners], so that equal corner sets have equal sums."""
     words = np.random.default_rng(0).integers(0, 2**63, int(elements.max()) + 1, dtype=np.uint64)
     return np.asarray(words[elements])
 
 
-def find_repeated(tets: Index) -> tuple[NDArray[np.bool_], int]:
-    """Which tets have the corners of an earlier one, in any order, and the earlier one of the first of them.
+def find_duplicates(tets: Index) -> tuple[NDArray[np.bool_], int]:
+    """Mask of tets with the corners of an earlier one, in any order, and the original of the first such tet.
 
-    Equal tets have equal sums of random words, one a vertex; only where two sums are equal the corners are compared.
+    Equal tets have equal sums of random words, one per vertex. Corners are compared only where two sums are equal.
     """
     words = corner_words(tets)
     sums = sum(words[:, k] for k in range(1, words.shape[1])) + words[:, 0]
@@ -124,26 +124,27 @@ def find_repeated(tets: Index) -> tuple[NDArray[np.bool_], int]:
 
 
 def determinants(points: Array, tets: Index) -> Array:
-    """Six times the signed volume."""
+    """Six times the signed volume of each tet."""
     origin = points[tets[:, 0]]
     a, b, c = (points[tets[:, k]] - origin for k in (1, 2, 3))
     return np.asarray(np.einsum("ij,ij->i", a, np.cross(b, c)))
 
 
 def is_flat(points: Array, tets: Index, values: Array) -> NDArray[np.bool_]:
-    """Which tets have a volume that float64 rounding alone could make out of a flat tet.
+    """Mask of tets whose volume is within the float64 rounding of a flat tet.
 
-    In a bounding box that reaches to M from the origin a coordinate is off by up to u M, a vertex by sqrt(3) u M. The
-    determinant changes by twice the opposite area for each, and the four areas add up to at most sqrt(3) l^2 (l the
-    longest edge): 6 u M l^2. Its evaluation adds less than 10 u l^3 (8 roundings of at most 1.16 l^3, the permanent).
+    In a bounding box that reaches to M from the origin, a coordinate is off by up to u M, a vertex by sqrt(3) u M. Each
+    vertex changes the determinant by twice the opposite area. The four areas add up to at most sqrt(3) l^2 (l the
+    longest edge), so the bound is 6 u M l^2. The evaluation adds less than 10 u l^3 (8 roundings of at most 1.16 l^3,
+    the permanent).
     """
     reach = float(np.abs(points).max())
 
     def noise(longest: Any) -> Any:
         return _ROUNDOFF * (6.0 * reach + 10.0 * longest) * longest**2
 
-    # No edge is longer than the diagonal: look closer only at what could be flat by that.
-    # Not `<=`: a determinant that overflows to NaN is no volume either.
+    # No edge exceeds the diagonal: measure edges only of tets that are flat by this bound. Not `<=`: a determinant that
+    # overflows to NaN is no volume either.
     flat = ~(np.abs(values) > noise(float(np.linalg.norm(np.ptp(points, axis=0)))))
     suspects = np.flatnonzero(flat)
     corners = points[tets[suspects]]
@@ -153,8 +154,8 @@ def is_flat(points: Array, tets: Index, values: Array) -> NDArray[np.bool_]:
     return np.asarray(flat)
 
 
-def refuse(name: str, bad: NDArray[np.bool_], elements: Index, fault: str, fix: str) -> None:
-    """Raise for the first bad element, if there is one."""
+def raise_for_first(name: str, bad: NDArray[np.bool_], elements: Index, fault: str, fix: str) -> None:
+    """Raise an error for the first bad element, if any."""
     rows = np.flatnonzero(bad)
     if rows.size:
         raise ValueError(
@@ -163,7 +164,7 @@ def refuse(name: str, bad: NDArray[np.bool_], elements: Index, fault: str, fix: 
 
 
 def compact(owner: str, elements: Index, count: int, *, drop: bool) -> tuple[Index, Index]:
-    """The referenced vertices, and the elements renumbered to them. Unreferenced vertices are refused unless dropped.
+    """Referenced vertices, and the elements renumbered to them. Unreferenced vertices are refused unless dropped.
 
     A vertex without an element has no mass: nothing would determine its motion.
     """
@@ -176,7 +177,7 @@ def compact(owner: str, elements: Index, count: int, *, drop: bool) -> tuple[Ind
     if not drop:
         raise ValueError(
             f"{owner}.vertices: every vertex must belong to an element, got {lost} of {count} that do not "
-            f"(the first is {int(np.argmin(used))}); pass drop_unreferenced=True to leave them out and renumber"
+            f"(the first is {int(np.argmin(used))}); pass drop_unreferenced=True to drop and renumber them"
         )
     warn(f"{owner}: {lost} of {count} vertices belong to no element and were left out; the others are renumbered")
     return kept, (np.cumsum(used) - 1)[elements]
@@ -208,18 +209,18 @@ def clean_tets(
     drop_unreferenced: bool = False,
     drop_degenerate: bool = False,
 ) -> dict[str, Any]:
-    """Fields of a `TetMesh`, checked, its tets all of positive volume: see there."""
+    """Check and repair the fields of a `TetMesh`; all tets of the result have positive volume."""
     points = check_points("TetMesh.vertices", vertices)
     elements = check_elements("TetMesh.tets", tets, 4, len(points))
     shares = None if fill is None else check_fill(fill, len(elements))
     groups = None if regions is None else check_regions(regions, len(elements))
     fix = "pass drop_degenerate=True to leave them out"
     if not drop_degenerate:
-        refuse("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
+        raise_for_first("TetMesh.tets", has_repeated_corner(elements), elements, "corners must differ", fix)
     with np.errstate(over="ignore", invalid="ignore"):
         signed = determinants(points, elements)
         flat = is_flat(points, elements, signed)
-    twice, first = find_repeated(elements)
+    twice, first = find_duplicates(elements)
     if drop_degenerate and (flat.any() or twice.any()):
         for bad, fault in ((flat, "have no volume"), (twice & ~flat, "come twice")):
             if bad.any():
@@ -230,10 +231,10 @@ def clean_tets(
         elements, signed, flat, twice = elements[kept], signed[kept], flat[kept], twice[kept]
         if not len(elements):
             raise ValueError("TetMesh.tets: no tet has a volume; are all vertices in one plane?")
-    refuse("TetMesh.tets", flat, elements, "volumes must not vanish (compared with rounding of the vertices)", fix)
+    raise_for_first("TetMesh.tets", flat, elements, "volumes must exceed the rounding of the vertices", fix)
     if twice.any():
-        again = f"every tet must come once (that at {first} comes again, with a volume of its own)"
-        refuse("TetMesh.tets", twice, elements, again, fix)
+        again = f"tets must be distinct (that at {first} comes again, with a volume of its own)"
+        raise_for_first("TetMesh.tets", twice, elements, again, fix)
     inverted = signed < 0
     flipped = int(inverted.sum())
     if flipped:
@@ -250,7 +251,7 @@ def clean_tets(
 
 
 def affine(name: str, matrix: Numbers) -> tuple[Array, Array]:
-    """The linear part and the offset of a 3x3 or an affine 4x4 matrix."""
+    """Linear part and offset of a 3x3 or an affine 4x4 matrix."""
     array = as_array(name, matrix, np.float64)
     if array.shape not in ((3, 3), (4, 4)):
         raise ValueError(f"{name} must be [3, 3] or [4, 4] (acting on columns), got {list(array.shape)}")

@@ -1,4 +1,4 @@
-"""How the tets of a mesh meet: in faces of two, or not as the user meant it, which is said."""
+"""Faces between tets: match them, and warn of folded, overlapping and unconnected tets."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from .mesh_checks import corner_words, determinants, has_repeated_corner, warn
 __all__ = [
     "ROUNDING",
     "TET_FACES",
-    "count_pieces",
+    "count_components",
     "match_faces",
     "merge_near",
     "mesh_components",
-    "numbered",
+    "number_rows",
     "report_faces",
 ]
 
@@ -31,30 +31,30 @@ Mask = NDArray[np.bool_]
 # Face k lies opposite corner k; seen from outside its corners run counter-clockwise when the tet has positive volume.
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
-# Vertices nearer than this part of the diagonal of their bounding box are at the same place: a few roundings of
-# float32, which many files hold, in a box about as far from the origin as it is wide.
+# Vertices nearer than this fraction of the bounding box diagonal coincide: a few roundings of float32, which many files
+# hold, in a box about as far from the origin as it is wide.
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
-# Along a direction that no grid has: different points have different places there.
+# No grid has this direction: different points project to different places.
 _DIRECTION = np.array([0.8128, 0.4953, 0.3065])
-# In work at a time, to bound memory.
+# elements processed at a time, to bound memory
 _CHUNK = 50_000
 
 
 class Faces(NamedTuple):
-    """Which faces do not belong to two tets on either side; 4 e + k is face k of tet e."""
+    """Faces that do not belong to two tets on opposite sides; 4 e + k is face k of tet e."""
 
-    lone: Index  # [n] of one tet
-    crowded: int  # how many belong to three or more tets
-    folded: int  # how many belong to two tets on the same side
+    lone: Index  # faces of one tet [n]
+    crowded: int  # number of faces of three or more tets
+    folded: int  # number of faces of two tets on the same side
 
 
 def match_faces(tets: Index) -> tuple[Index, Mask]:
-    """All 4 E faces (4 e + k is face k of tet e), equal ones side by side, and where a new one begins."""
+    """Order of all 4 E faces (4 e + k is face k of tet e) that puts equal ones side by side, and where each begins."""
     return _match(tets[:, TET_FACES].reshape(-1, 3))
 
 
 def _match(triangles: Index) -> tuple[Index, Mask]:
-    """The order that puts equal triangles side by side, whatever corner is first, and where a new one begins."""
+    """Order that puts equal triangles side by side, whatever corner is first, and where each begins."""
     faces = np.sort(triangles, axis=1)
     order = np.lexsort((faces[:, 2], faces[:, 0] * (int(faces.max(initial=0)) + 1) + faces[:, 1]))
     faces = faces[order]
@@ -64,7 +64,7 @@ def _match(triangles: Index) -> tuple[Index, Mask]:
 
 
 def _is_odd(tets: Index) -> Mask:
-    """Whether a face's corners, as `TET_FACES` lists them, are an odd permutation of ascending ones [E, 4].
+    """Whether the corners of a face, as in `TET_FACES`, are an odd permutation of ascending ones [E, 4].
 
     Two tets on either side of a face list it once evenly and once oddly.
     """
@@ -78,7 +78,7 @@ def sort_faces(tets: Index) -> Faces:
 
     A number holds the upper bits of a sum of random words of the corners, the orientation, and the face. Faces with
     equal bits that are no pair with opposite orientation are compared by their corners. A pair of two different faces
-    would pass for one: expected are n^2 / 2^43 among n faces of a million tets that lie at the boundary.
+    would be accepted; n^2 / 2^43 such pairs are expected among n boundary faces of a million tets.
     """
     words = corner_words(tets)
     bits = np.uint64(int(tets.size - 1).bit_length())
@@ -92,7 +92,7 @@ def sort_faces(tets: Index) -> Faces:
         sums = (w[:, 0] + w[:, 1]) + (w[:, 2] + w[:, 3])
         by_tet[block] |= ((sums[:, None] - w) & upper) | (_is_odd(tets[block]).astype(np.uint64) << bits)
     keys.sort()
-    # Two orientations of a face differ in the lowest bit that is left.
+    # The two orientations of a face differ in the lowest remaining bit.
     step = keys[1:] ^ keys[:-1]
     step >>= bits
     begins = np.append(True, step > one)
@@ -125,8 +125,8 @@ def _corners(tets: Index, faces: Index) -> Index:
     return np.asarray(tets[tet[:, None], TET_FACES[k]])
 
 
-def numbered(rows: Array) -> Index:
-    """The same number for equal rows [n, 3]."""
+def number_rows(rows: Array) -> Index:
+    """Numbers for rows [n, 3]; equal rows have equal numbers."""
     order = np.lexsort(rows.T)
     new = np.append(True, (rows[order[1:]] != rows[order[:-1]]).any(axis=1))[: len(rows)]
     numbers = np.empty(len(rows), dtype=np.int64)
@@ -135,17 +135,17 @@ def numbered(rows: Array) -> Index:
 
 
 def merge_near(points: Array, tolerance: float) -> Index:
-    """For each point [n] the lowest number of those that hang together with it by distances up to `tolerance`."""
+    """For each point [n], the lowest number in its group; groups are connected by distances up to `tolerance`."""
     first = np.arange(len(points))
     x, y, z = ((points - points[0]) * _DIRECTION).T
-    along = x + y + z  # not by a product of matrices: equal points have equal bits
+    along = x + y + z  # not by a product of matrices: equal points must have equal bits
     order = np.argsort(along)
-    # What is near is near along any direction: look closer only at what is near a neighbour there.
+    # Near points are near in every projection: compare only neighbours along one direction.
     close = np.diff(along[order]) <= tolerance * (1.0 + 1e-3)
     suspects = order[np.append(close, False) | np.append(False, close)]
     if not len(suspects):
         return first
-    number = numbered(points[suspects])
+    number = number_rows(points[suspects])
     _, one = np.unique(number, return_index=True)
     pairs = cKDTree(points[suspects[one]]).query_pairs(tolerance, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs), dtype=np.int8), (pairs[:, 0], pairs[:, 1])), shape=2 * (len(one),))
@@ -157,18 +157,18 @@ def merge_near(points: Array, tolerance: float) -> Index:
 
 
 def report_faces(points: Array, tets: Index) -> None:
-    """Warn of tets that overlap, that lie on one another unjoined, and whose faces do not match. All are positive."""
+    """Warn of tets that overlap, that touch unconnected, or whose faces do not match. All volumes are positive."""
     faces = sort_faces(tets)
     if faces.crowded:
         warn(
-            f"TetMesh: {faces.crowded} of the faces belong to three tets or more, of which some overlap: leave out the "
-            "tets that are no part of the body"
+            f"TetMesh: {faces.crowded} of the faces belong to three tets or more, and some of these tets overlap; "
+            "remove the tets that are no part of the body"
         )
     if faces.folded:
         _report_folded(points, tets, faces)
     if not len(faces.lone):
         return
-    # Relative to the box, so that no size overflows.
+    # relative to the box, so that no size overflows
     low, high = (np.array([reduce(column) for column in points.T]) for reduce in (np.min, np.max))
     size = float(np.linalg.norm(high - low))
     at_boundary = np.zeros(len(points), dtype=bool)
@@ -176,7 +176,7 @@ def report_faces(points: Array, tets: Index) -> None:
     vertices = np.flatnonzero(at_boundary)
     first = np.arange(len(points))
     first[vertices] = vertices[merge_near((points[vertices] - low) / size, ROUNDING)]
-    # A tet that is smaller than the tolerance lies on nothing but itself.
+    # a tet smaller than the tolerance touches only itself
     lone = faces.lone[~has_repeated_corner(first[tets[faces.lone // 4]])]
     order, begins = _match(first[_corners(tets, lone)])
     alone = begins & np.append(begins[1:], True)
@@ -186,9 +186,9 @@ def report_faces(points: Array, tets: Index) -> None:
     unmatched = boundary.count_unmatched() if len(boundary.tets) else 0
     if unmatched:
         warn(
-            f"TetMesh: {unmatched} of {len(faces.lone)} outer faces lie on faces with other corners, and nothing joins "
-            "the tets there. Vertices lie on faces or edges of tets that do not use them, or neighbours split a "
-            "quadrilateral along different diagonals: split the cells so that faces match"
+            f"TetMesh: {unmatched} of {len(faces.lone)} outer faces lie on faces with other corners, so the tets there "
+            "are not connected. Vertices lie on faces or edges of other tets, or neighbours split a quadrilateral "
+            "along different diagonals. Split the cells so that faces match"
         )
 
 
@@ -199,16 +199,16 @@ def _report_folded(points: Array, tets: Index, faces: Faces) -> None:
     fills = "" if hull is None else f", but enclose {hull:.4g} m^3"
     warn(
         f"TetMesh: {faces.folded} of {inner} inner faces have both of their tets on one side: the mesh is folded, and "
-        f"tets overlap. Their volumes add up to {volume:.4g} m^3{fills}. No winding mends that: move the vertices, or "
-        "take the mesh as it was before it was deformed"
+        f"tets overlap. Their volumes add up to {volume:.4g} m^3{fills}. No winding repairs that: move the vertices, "
+        "or take the undeformed mesh"
     )
 
 
 def _enclosed(points: Array, tets: Index) -> float | None:
-    """The volume of a folded mesh [m^3], in which tets that are the wrong way round count negative.
+    """Volume of a folded mesh [m^3], with inverted tets counted negative; None if no orientation is consistent.
 
-    Two nodes stand for either orientation of a tet; a face joins those that agree across it. Each piece of the mesh
-    makes two components, mirror images of each other. None where it makes one: no orientation agrees.
+    Two nodes represent the orientations of a tet; a face joins those that agree across it. Each component of the mesh
+    gives two components of this graph, mirror images of each other. It gives one if no orientation is consistent.
     """
     order, begins = match_faces(tets)
     inner = np.flatnonzero(~begins)
@@ -228,39 +228,39 @@ def _enclosed(points: Array, tets: Index) -> float | None:
 
 
 def mesh_components(tets: Index) -> Index:
-    """A number for each vertex [V]: equal where vertices hang together by tets."""
+    """Component number of each vertex [V]; vertices connected by tets have equal numbers."""
     count = int(tets.max()) + 1
     rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def count_pieces(tets: Index) -> int:
-    """How many pieces hang together by vertices."""
+def count_components(tets: Index) -> int:
+    """Number of components that share no vertices."""
     return len(np.unique(mesh_components(tets)[tets[:, 0]]))
 
 
 def _report_unmerged(count: str, tets: Index, first: Index, tolerance: float) -> None:
     warn(
-        f"TetMesh: {count} outer faces lie on one another with vertices of their own, so nothing joins the tets "
-        f"there: the mesh is in {count_pieces(tets)} pieces. mesh.merged() makes one of vertices at the same place, "
-        f"within {tolerance:.2g} m, which leaves {count_pieces(first[tets])}"
+        f"TetMesh: {count} outer faces coincide without common vertices, so the tets there are not connected: the mesh "
+        f"is in {count_components(tets)} pieces. mesh.merged() merges vertices within {tolerance:.2g} m, which leaves "
+        f"{count_components(first[tets])}"
     )
 
 
 class _Boundary(NamedTuple):
-    """Faces of one tet each, in a box of diagonal 1."""
+    """Boundary faces of one tet each, in a box of diagonal 1."""
 
     tets: Index  # [n] of each
-    vertices: Index  # [n, 3] equal where they are at the same place
+    vertices: Index  # [n, 3]; coincident vertices have equal numbers
     corners: Array  # [n, 3, 3]
-    normals: Array  # [n, 3] outwards, of length 1
+    normals: Array  # unit outward normal [n, 3]
 
     @classmethod
     def of(cls, places: Array, tets: Index, faces: Index, first: Index) -> _Boundary:
-        """Leave out faces so narrow, and tets so low above them, that they lie on their neighbours within rounding.
+        """Boundary without faces so narrow, or tets so flat, that they touch their neighbours within rounding.
 
-        The middle of a triangle is a third of its height away from its edges.
+        The centroid of a triangle is a third of its height away from its edges.
         """
         vertices = _corners(tets, faces)
         corners = places[vertices]
@@ -276,7 +276,7 @@ class _Boundary(NamedTuple):
         return int((self.lie_on_others() | self.reach_into_others()).sum())
 
     def lie_on_others(self) -> Mask:
-        """Whether the middle of one lies on another that looks the other way, within rounding: both count."""
+        """Mask of faces whose centroid lies on an opposite face within rounding; both are marked."""
         sides = self.corners[:, [1, 2, 0]] - self.corners
         inwards = np.cross(self.normals[:, None], sides / np.linalg.norm(sides, axis=2, keepdims=True))
         centres = self.corners.mean(axis=1)
@@ -296,10 +296,10 @@ class _Boundary(NamedTuple):
         return found
 
     def reach_into_others(self) -> Mask:
-        """Whether four of them are the faces of a tet that is not there, and the tets behind them reach into it.
+        """Mask of faces that bound a missing tet, four each, into which the tets behind them reach.
 
-        So they do where neighbours split a bent quadrilateral along different diagonals. Each two of the four have an
-        edge in common.
+        This happens where neighbours split a bent quadrilateral along different diagonals. Any two of the four faces
+        share an edge.
         """
         ends = np.sort(self.vertices[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2), axis=1)
         order = np.lexsort(ends.T)
@@ -324,7 +324,7 @@ class _Boundary(NamedTuple):
 
 
 def _near(centres: Array, radii: Array) -> Iterator[Index]:
-    """Pairs [n, 2] of balls, once each, of which one holds the centre of the other: by powers of two of the radii."""
+    """Pairs [n, 2] of spheres of which one holds the other's centre, once each; by powers of two of the radii."""
     octaves = np.frexp(radii)[1]
     for octave in np.unique(octaves):
         large, small = np.flatnonzero(octaves == octave), np.flatnonzero(octaves < octave)

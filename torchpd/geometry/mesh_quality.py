@@ -1,4 +1,4 @@
-"""What a tetrahedral mesh is worth to the solver: volumes, dihedral angles and the element bound l_e."""
+"""Quality of a tetrahedral mesh: volumes, dihedral angles and the element bound l_e of the solver."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .mesh_faces import count_pieces
+from .mesh_faces import count_components
 
 __all__ = ["MeshQuality", "element_bounds", "measure_quality", "shape_gradients", "smallest_dihedral"]
 
@@ -17,14 +17,14 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeshQuality:
-    """Shape measures, one value per tet, and a readable `print`."""
+    """Shape measures, one value per tet; `print` gives a summary."""
 
-    volumes: Array  # [E] m^3
-    min_dihedral: Array  # [E] rad, 70.5 degrees in the regular tet
-    max_dihedral: Array  # [E] rad
-    element_bounds: Array  # [E] l_e, between 4/3 (regular) and 4 (sliver): what a stable diagonal has to carry
-    fill: Array | None  # [E] how much of each tet is material, see `TetMesh`
-    pieces: int  # face-, edge- or vertex-connected pieces
+    volumes: Array  # volume [E] m^3
+    min_dihedral: Array  # smallest dihedral angle [E] rad, 70.5 degrees in the regular tet
+    max_dihedral: Array  # largest dihedral angle [E] rad
+    element_bounds: Array  # l_e [E], from 4/3 (regular) to 4 (sliver): the factor of a stable diagonal
+    fill: Array | None  # material fraction of each tet [E], see `TetMesh`
+    pieces: int  # components connected by faces, edges or vertices
 
     def __repr__(self) -> str:
         rows = (
@@ -46,7 +46,7 @@ class MeshQuality:
 
 
 def shape_gradients(vertices: Array, tets: Index) -> tuple[Array, Array]:
-    """grad N_a of the linear shape functions [E, 4, 3] in 1/m, and volumes [E].
+    """Gradients of the linear shape functions N_a [E, 4, 3] in 1/m, and volumes [E] in m^3.
 
     grad N_1 = (e2 x e3) / det and cyclic with e_k = x_k - x_0; grad N_0 is minus their sum.
     """
@@ -71,16 +71,16 @@ def _unit(gradients: Array) -> Array:
 
 
 def element_bounds(normals: Array) -> Array:
-    """The element bound from unit normals n_a = grad N_a / |grad N_a| [E, 4, 3].
+    """Element bound l_e from unit normals n_a = grad N_a / |grad N_a| [E, 4, 3].
 
-    l_e is the largest eigenvalue of diag(K)^-1/2 K diag(K)^-1/2, K = grad N grad N^T. That matrix is n n^T
-    (4x4), which has the nonzero eigenvalues of n^T n (3x3). They are three and add up to 4: l_e lies in [4/3, 4].
+    l_e is the largest eigenvalue of diag(K)^-1/2 K diag(K)^-1/2, K = grad N grad N^T. That matrix is n n^T (4x4), which
+    has the nonzero eigenvalues of n^T n (3x3). They are three and add up to 4: l_e lies in [4/3, 4].
     """
     return np.asarray(np.linalg.eigvalsh(np.einsum("eai,eaj->eij", normals, normals))[:, 2])
 
 
 def _dihedral_angles(normals: Array) -> Array:
-    """The six dihedral angles [E, 6]: pi minus the angle between normals, by Kahan's formula, exact near 0 and pi."""
+    """Six dihedral angles [E, 6]: pi minus the angle between normals, by Kahan's formula, exact near 0 and pi."""
     angles = np.empty((len(normals), 6))
     for column, (a, b) in enumerate(((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))):
         apart = _lengths(normals[:, a] - normals[:, b])
@@ -90,7 +90,7 @@ def _dihedral_angles(normals: Array) -> Array:
 
 
 def smallest_dihedral(vertices: Array, tets: Index) -> float:
-    """Of all tets of a valid mesh [rad]."""
+    """Smallest dihedral angle of a valid mesh [rad]."""
     gradients, _ = shape_gradients(vertices, tets)
     return float(_dihedral_angles(_unit(gradients)).min())
 
@@ -106,5 +106,5 @@ def measure_quality(vertices: Array, tets: Index, fill: Array | None = None) -> 
         max_dihedral=angles.max(axis=1),
         element_bounds=element_bounds(normals),
         fill=fill,
-        pieces=count_pieces(tets),
+        pieces=count_components(tets),
     )

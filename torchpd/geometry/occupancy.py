@@ -1,7 +1,7 @@
-"""How much of each tet of a lattice lies inside a surface: from where the lines of a fine grid cross the surface.
+"""Fraction of each lattice tet inside a surface, from the crossings of the lines of a fine grid with the surface.
 
-A surface falls into parts, connected pieces that enclose a volume each; the inside of the surface is what lies inside
-of any part, so that cavities count as filled and parts may overlap. What encloses nothing is a sheet.
+A surface consists of parts: connected pieces that enclose a volume each. The inside of the surface is the union of
+their insides, so cavities count as filled and parts may overlap. A piece that encloses nothing is a sheet.
 """
 
 from __future__ import annotations
@@ -17,62 +17,62 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from .bcc_lattice import Lattice, candidates, split_long
-from .mesh_checks import find_repeated
-from .mesh_faces import numbered
+from .mesh_checks import find_duplicates
+from .mesh_faces import number_rows
 from .tri_mesh import TriMesh
 
-__all__ = ["LEAST_FILL", "Parts", "inside_share", "parts_of"]
+__all__ = ["MIN_FILL", "Parts", "inside_share", "parts_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# No tet gets less: neighbours of far less stiffness would slow every solver down, and one of none make it singular.
-LEAST_FILL = 0.05
+# Least fraction of a tet: a much softer neighbour slows every solver, and an empty one is singular.
+MIN_FILL = 0.05
 
-# Samples along the edge of a cube, 18 a tet. Even, so that none lies in a symmetry plane of the cube, and lattice
+# Samples along the edge of a cube, 18 per tet. Even, so that none lies in a symmetry plane of the cube, and lattice
 # planes have as many on either side.
 _SAMPLES = 6
-# A part that is thinner than this, in cubes on average, encloses nothing: a surface and its own way back.
+# a part thinner than this on average, in cubes, encloses nothing: a surface and its reverse
 _THIN = 1e-3
-# The nearest vertices that may count as one with a vertex: the others are reached through these.
+# nearest vertices that may be merged with a vertex; the others are reached through these
 _COPIES = 7
-# Rounding of a covered length.
+# rounding of a covered length
 _TIE = 1e-3
-# Samples in work at a time, and small triangles, to bound memory.
+# samples and small triangles processed at a time, to bound memory
 _SLAB = 5_000_000
 _CHUNK = 20_000
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Triangles of a surface by what they enclose."""
+    """Triangles of a surface by the volume that they enclose."""
 
-    triangles: Array  # [T, 3, 3] m, of parts that are closed, or were closed by caps
-    part: Index  # [T] the part of each
-    oriented: Mask  # [P] whether the triangles of a part are all wound alike
-    sheets: Array  # [S, 3, 3] m, of parts that are left open
-    caps: Array  # [C, 3, 3] m, the last of `triangles`: cones over holes, an apex each
-    own: int  # the first of `triangles`, which are the surface's
-    open_edges: tuple[int, int]  # edges that stay open where seams are closed, and all edges
+    triangles: Array  # triangles of closed parts and caps [T, 3, 3] m
+    part: Index  # part of each [T]
+    oriented: Mask  # whether the triangles of a part have consistent winding [P]
+    sheets: Array  # triangles of open parts [S, 3, 3] m
+    caps: Array  # cones over holes [C, 3, 3] m, an apex each; the last of `triangles`
+    own: int  # number of the surface's own triangles, the first of `triangles`
+    open_edges: tuple[int, int]  # number of edges still open after closing seams, and of all edges
 
 
 class _Edges(NamedTuple):
-    ends: Index  # [n, 2] vertices of each edge
-    triangle: Index  # [n] one that it belongs to
-    open: Mask  # [n] an odd number of triangles have it
-    turned: Mask  # [n] its triangles do not run along it in both directions alike
+    ends: Index  # vertices of each edge [n, 2]
+    triangle: Index  # one part that has it [n]
+    open: Mask  # an odd number of triangles have it [n]
+    turned: Mask  # its triangles run along it in unequal numbers per direction [n]
 
 
 def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
-    """Take a surface apart, and close what is open by a cone over each connected piece of its open edges.
+    """Split a surface into parts, and close holes by a cone over each connected piece of open edges.
 
-    Parts that are closed as they are stay exact. In the others, vertices at open edges that are closer than `tolerance`
-    count as one, since files repeat vertices along seams, not always to the bit: strips of triangles close the seams.
-    Pieces of which most edges are still open then are sheets. Of triangles that come on both sides one counts.
+    Parts that are already closed stay exact. In the others, vertices at open edges closer than `tolerance` are merged,
+    since files repeat vertices along seams, not always to the bit; strips of triangles close the seams. Pieces with
+    mostly open edges after that are sheets. Triangles that come from both sides count once.
     """
-    same = numbered(surface.vertices)
-    triangles = surface.triangles[_single(surface.triangles, same)]
+    same = number_rows(surface.vertices)
+    triangles = surface.triangles[_without_duplicates(surface.triangles, same)]
     part = _connected(triangles, same)
     edges = _edges(triangles, same)
     closed, oriented = (np.ones(int(part.max()) + 1, dtype=bool) for _ in range(2))
@@ -83,8 +83,8 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     none = np.empty((0, 3, 3))
     if not rest.any():
         return Parts(corners, part, oriented, none, none, len(corners), (0, len(edges.open)))
-    places, near = _welded(surface.vertices, same, _edges(triangles[rest], same), tolerance)
-    loose = triangles[rest][_single(triangles[rest], near)]
+    places, near = _merge_open_edges(surface.vertices, same, _edges(triangles[rest], same), tolerance)
+    loose = triangles[rest][_without_duplicates(triangles[rest], near)]
     beside = int(closed[part[edges.triangle]].sum())
     own, edges = _connected(loose, near), _edges(loose, near)
     count = int(own.max()) + 1
@@ -108,12 +108,12 @@ def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     )
 
 
-def _single(triangles: Index, same: Index) -> Mask:
-    """Which triangles count: of those that come again the first, in parts which that closes or that come again whole.
+def _without_duplicates(triangles: Index, same: Index) -> Mask:
+    """Mask of triangles without duplicates, in parts that this closes or that consist of duplicates.
 
-    Many models have every triangle twice, once from either side: by windings, or by turns, they would enclose nothing.
+    Many models list every triangle twice, once from either side: by winding or by parity they would enclose nothing.
     """
-    again = find_repeated(same[triangles])[0]
+    again = find_duplicates(same[triangles])[0]
     if again.any():
         part = _connected(triangles, same)
         edges = _edges(triangles[~again], same)
@@ -123,10 +123,10 @@ def _single(triangles: Index, same: Index) -> Mask:
     return ~again
 
 
-def _welded(vertices: Array, same: Index, edges: _Edges, tolerance: float) -> tuple[Array, Index]:
-    """A place and a number for every vertex: those of several that count as one are alike.
+def _merge_open_edges(vertices: Array, same: Index, edges: _Edges, tolerance: float) -> tuple[Array, Index]:
+    """Position and number of every vertex; merged vertices have equal ones.
 
-    Such are the ends of open edges that are closer than `tolerance`, and than half of all edges there: the neighbours
+    Ends of open edges are merged if they are closer than `tolerance`, and than half of all edges there: the neighbours
     along a fine rim stay apart.
     """
     shortest = np.full(len(vertices), np.inf)
@@ -151,7 +151,7 @@ def _welded(vertices: Array, same: Index, edges: _Edges, tolerance: float) -> tu
 
 
 def _strips(vertices: Array, places: Array, edges: _Edges, part: Index) -> tuple[Array, Index]:
-    """Triangles [C, 3, 3] between the open edges and where the places of their ends are, and the part of each."""
+    """Triangles [C, 3, 3] between the open edges and the merged positions of their ends, and the part of each."""
     ends, of = edges.ends[edges.open], part[edges.triangle[edges.open]]
     (a, b), (c, d) = vertices[ends.T], places[ends.T]
     strips = np.concatenate([np.stack([a, b, d], axis=1), np.stack([a, d, c], axis=1)])
@@ -160,7 +160,7 @@ def _strips(vertices: Array, places: Array, edges: _Edges, part: Index) -> tuple
 
 
 def _connected(triangles: Index, same: Index) -> Index:
-    """Number of the connected piece that each triangle belongs to."""
+    """Number of the connected piece of each triangle."""
     corners = same[triangles]
     rows, columns = corners[:, [0, 1]].reshape(-1), corners[:, [1, 2]].reshape(-1)
     count = int(same.max()) + 1
@@ -170,7 +170,7 @@ def _connected(triangles: Index, same: Index) -> Index:
 
 
 def _edges(triangles: Index, same: Index) -> _Edges:
-    """The edges of a surface, once each; those that shrink to a point where vertices are the same are left out."""
+    """Edges of a surface, once each, without edges whose ends were merged."""
     ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     keys = same[ends]
     real = np.flatnonzero(keys[:, 0] != keys[:, 1])
@@ -204,9 +204,9 @@ def _cones(vertices: Array, same: Index, edges: _Edges, part: Index) -> tuple[Ar
 
 
 class _Intervals(NamedTuple):
-    """Pieces of grid lines inside of a part."""
+    """Intervals of grid lines inside a part."""
 
-    line: Index  # [n, 2] which one, by the samples of the two other axes
+    line: Index  # grid line, by the samples of the two other axes [n, 2]
     start: Array  # in samples
     stop: Array
     part: Index
@@ -216,7 +216,7 @@ class _Intervals(NamedTuple):
 
 
 def inside_share(lattice: Lattice, parts: Parts, walls: Mask) -> tuple[NDArray[np.float32], Mask]:
-    """The share of each wall tet [axis, i, j, k, edge] that lies inside, and which parts enclose a volume [P]."""
+    """Fraction of each surface tet [axis, i, j, k, edge] inside the surface; and the parts that have a volume [P]."""
     pieces, parents = split_long(lattice.coordinates(parts.triangles))
     part = parts.part[parents]
     samples = np.array(lattice.shape) * _SAMPLES
@@ -236,17 +236,17 @@ def inside_share(lattice: Lattice, parts: Parts, walls: Mask) -> tuple[NDArray[n
         halves = (own @ table).reshape(-1, 3, 2, 4)
         cubes[:, 0] += slab.start
         for axis in range(3):
-            for side in (0, 1):  # a tet is numbered after the lower of its two cubes
+            for side in (0, 1):  # a tet has the number of the lower of its two cubes
                 i, j, k = (cubes - (1 - side) * (np.arange(3) == axis)).T
                 share[axis, i, j, k] += halves[:, axis, side]
     return share, np.asarray(solid)
 
 
 def _intervals(triangles: Array, part: Index, oriented: Mask, axis: int, samples: Index) -> _Intervals:
-    """Where the grid lines along an axis run inside.
+    """Intervals inside the surface of the grid lines along an axis.
 
-    An oriented part is where its crossings, counted with their signs, do not add up to zero, so that it may overlap
-    itself; another is between its crossings by turns.
+    An oriented part is inside where its signed crossings add up to a nonzero number, so it may overlap itself. Other
+    parts use the parity of the crossings.
     """
     chunks = [slice(start, start + _CHUNK) for start in range(0, len(triangles), _CHUNK)]
     found = [_crossings(triangles[chunk], axis, samples) for chunk in chunks]
@@ -268,11 +268,11 @@ def _intervals(triangles: Array, part: Index, oriented: Mask, axis: int, samples
 
 
 def _crossings(triangles: Array, axis: int, samples: Index) -> tuple[Index, Index, Array, Array]:
-    """Triangle, grid line, depth along it and sign of every crossing of small triangles with grid lines along an axis.
+    """Triangle, grid line, depth and sign of every crossing of small triangles with grid lines along an axis.
 
-    A line crosses a triangle when a ray from it, across the plane that the axis is normal to, passes an odd number of
-    edges. Whether it passes an edge depends on the ends of that alone, so the lines meet a closed surface an even
-    number of times each, and as often from either side, wherever they meet edges and vertices.
+    A line crosses a triangle if a ray from it, in the plane normal to the axis, passes an odd number of edges. Whether
+    it passes an edge depends on the ends of that edge alone. So each line meets a closed surface an even number of
+    times, as often from either side, also through edges and vertices.
     """
     b, c = (axis + 1) % 3, (axis + 2) % 3
     flat = triangles[:, :, [b, c]]
@@ -295,17 +295,17 @@ def _crossings(triangles: Array, axis: int, samples: Index) -> tuple[Index, Inde
         second = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
         third = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
         depth = heights[:, 0] + second * (heights[:, 1] - heights[:, 0]) + third * (heights[:, 2] - heights[:, 0])
-    # of a triangle that is seen edge on any depth that it has will do
+    # a triangle seen edge on has several depths; any will do
     depth = np.where(np.isfinite(depth), depth, heights[:, 0])
     return which, at, np.clip(depth, heights.min(axis=1), heights.max(axis=1)), sign
 
 
 def _slabs(lattice: Lattice, found: list[_Intervals]) -> Iterator[tuple[slice, NDArray[np.float32]]]:
-    """Layers of cubes, and how much of the little cube around each sample [x, y, z] in them is inside of any part.
+    """Layers of cubes, and the fraction of the small cube around each sample [x, y, z] inside any part.
 
-    Each axis has an opinion, the covered length of its grid line. Where most of them say inside (more than half), or
-    outside, those that agree and are least sure are right: where a face passes, the line that is steepest to it. An
-    axis that is alone may look through a crack. Half is both, since a face may lie in a plane of samples.
+    Each axis estimates it: the covered length of its grid line. A majority of axes decides between inside (more than
+    half) and outside, and the least certain of that majority gives the value: the line steepest to a nearby face. A
+    single axis may look through a crack. One half counts as both, since a face may lie in a plane of samples.
     """
     samples = np.array(lattice.shape) * _SAMPLES
     thick = max(1, int(_SLAB // (_SAMPLES * samples[1] * samples[2])))
@@ -321,9 +321,9 @@ def _slabs(lattice: Lattice, found: list[_Intervals]) -> Iterator[tuple[slice, N
 
 
 def _covered(inner: _Intervals, axis: int, low: Index, counts: Index) -> NDArray[np.float32]:
-    """How much of the length around each sample, n - 1/2 to n + 1/2 of its grid line, is inside, in a box of samples.
+    """Covered length around each sample, n - 1/2 to n + 1/2 of its grid line, in a box of samples.
 
-    An interval adds a step at either end, up and down, whose edge lies within the length of one sample.
+    An interval adds a step up and a step down, each within the length of one sample.
     """
     others = [(axis + 1) % 3, (axis + 2) % 3]
     line = inner.line - low[others]
@@ -344,18 +344,18 @@ def _covered(inner: _Intervals, axis: int, low: Index, counts: Index) -> NDArray
 
 
 def _cubes_of(walls: Mask) -> Mask:
-    """The cubes [i, j, k] that a wall tet reaches into: the two on both sides of its square."""
+    """The two cubes [i, j, k] on both sides of the square of a surface tet."""
     cubes = walls.any(axis=(0, 4))
     for axis in range(3):
-        # walls keep two cubes away from the ends: nothing comes round
+        # surface tets keep two cubes away from the ends: nothing wraps around
         cubes = cubes | np.roll(walls[axis].any(axis=-1), 1, axis=axis)
     return np.asarray(cubes)
 
 
 def _half_tets() -> NDArray[np.float32]:
-    """What a sample of a cube [s] adds to the shares of the 24 half tets in it [axis, side, edge].
+    """Contribution of a sample of a cube [s] to the fractions of its 24 half tets [axis, side, edge].
 
-    See `Lattice.locate`. Samples that lie in faces between tets are shared among these.
+    See `Lattice.locate`. Half tets share the samples that lie in their common faces.
     """
     q = 2 * np.stack(np.meshgrid(*3 * [np.arange(_SAMPLES)], indexing="ij"), axis=-1).reshape(-1, 3) + 1 - _SAMPLES
     table = np.zeros((len(q), 3, 2, 4))

@@ -1,4 +1,4 @@
-"""Shapes that need no file: a box of tets, one tet, and an octopus to drop."""
+"""Shapes that need no file: a box, one tet, and an octopus."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Index = NDArray[np.int64]
 
 
 def _kuhn_cube() -> Index:
-    """The six tets of a cube [6, 4, 3]: along each way from (0, 0, 0) to (1, 1, 1) over three edges."""
+    """The six tets of a cube [6, 4, 3]: one for each path from (0, 0, 0) to (1, 1, 1) along three edges."""
     tets = np.zeros((6, 4, 3), dtype=np.int64)
     for row, order in enumerate(permutations(range(3))):
         for step, axis in enumerate(order):
@@ -31,7 +31,7 @@ def _kuhn_cube() -> Index:
 
 
 def box(size: Sequence[float] | Array = (1.0, 0.2, 0.2), cells: Sequence[int] | Index = (25, 5, 5)) -> TetMesh:
-    """A box [0, x] x [0, y] x [0, z] in a regular grid, six tets a cell (Kuhn), all along the same diagonals.
+    """A box [0, x] x [0, y] x [0, z] in a regular grid, six tets per cell (Kuhn) with parallel diagonals.
 
     Vertex (i, j, k) has the number (i (ny + 1) + j) (nz + 1) + k.
 
@@ -67,7 +67,7 @@ def single_tet(edge: float = 1.0) -> TetMesh:
 
 
 def _arm(angle: float) -> tuple[Array, Array]:
-    """Points along an arm and its radius there: out and down from the body, along the ground, the tip turned up."""
+    """Points along an arm and its radius there: out and down from the body, along the ground, up at the tip."""
     t = np.linspace(0.0, 1.0, 12)
     reach = 0.06 + 0.42 * t
     height = 0.058 + 0.17 * (1.0 - t) ** 3 + 0.10 * np.maximum((t - 0.5) / 0.5, 0.0) ** 2
@@ -77,7 +77,7 @@ def _arm(angle: float) -> tuple[Array, Array]:
 
 
 def _tube(points: Array, spine: Array, radii: Array) -> Array:
-    """Distance [n] from the tube around a chain of segments, negative inside; its radius goes evenly along each one."""
+    """Distance [n] from the tube around a chain of segments, negative inside; the radius is linear along each."""
     distance = np.full(len(points), np.inf)
     for a, b, start, end in zip(spine[:-1], spine[1:], radii[:-1], radii[1:], strict=True):
         t = np.clip((points - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
@@ -91,7 +91,7 @@ def _ball(points: Array, center: Sequence[float], radius: float) -> Array:
 
 
 def _blend(distances: Sequence[Array], width: float) -> Array:
-    """A smooth union, -width log sum exp(-d / width): the least distance, with seams rounded over about `width`."""
+    """Smooth union, -width log sum exp(-d / width): the least distance, rounded over about `width` at joints."""
     stacked = np.stack(distances)
     least = stacked.min(axis=0)
     return np.asarray(least - width * np.log(np.exp((least - stacked) / width).sum(axis=0)))
@@ -100,7 +100,7 @@ def _blend(distances: Sequence[Array], width: float) -> Array:
 def octopus(arms: int = 8, cells: int = 24) -> TriMesh:
     """A small octopus, about 1 m wide and 0.5 m tall, that stands on its arms on y = 0 and looks along z.
 
-    Closed and smooth. Its arms are 0.1 m thick or more, at least two lattice cells at `tetrahedralize(cells=20)`.
+    Closed and smooth. Its arms are at least 0.1 m thick, two lattice cells at `tetrahedralize(cells=20)`.
 
     Args:
         arms: 3 to 8.

@@ -1,4 +1,4 @@
-"""Tetrahedral meshes, of which bodies are made: frozen, and checked once, so that nothing behind them checks again."""
+"""Tetrahedral meshes: immutable, and checked once on creation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..common.checks import check_scalar
 from ..common.synonyms import check_arguments
 from ..common.units import Unit
 from ..formats.bodies import read_body
-from ..formats.guard import naming
+from ..formats.guard import name_file_in_errors
 from .embedding import Embedding, embed_surface, embed_triangles
 from .mesh_checks import (
     MeshWarning,
@@ -22,7 +22,7 @@ from .mesh_checks import (
     determinants,
     has_repeated_corner,
     scaling,
-    store,
+    set_frozen,
     translation,
     warn,
 )
@@ -31,7 +31,7 @@ from .mesh_files import write_tets
 from .mesh_quality import MeshQuality, measure_quality
 from .tri_mesh import PathLike, TriMesh
 
-__all__ = ["MeshWarning", "TetMesh", "embed", "trusted"]
+__all__ = ["MeshWarning", "TetMesh", "embed", "without_face_checks"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -41,25 +41,25 @@ Index = NDArray[np.int64]
 class TetMesh:
     """A tetrahedral mesh. Every tet has positive volume: det(x1 - x0, x2 - x0, x3 - x0) > 0.
 
-    Tets that come with the opposite winding are turned (their last two corners change places), which is reported by a
-    `MeshWarning` and counted in `flipped`. Others tell of tets that meet as hardly any body does: inner faces with both
-    tets on one side (a folded mesh), faces of three tets, faces that lie on one another without common vertices, see
-    `merged`, and faces that lie on faces with other corners. Pieces that lie apart are no fault: `quality()` counts
-    them.
+    Tets with the opposite winding are turned: their last two corners change places. A `MeshWarning` reports them, and
+    `flipped` counts them. Other warnings report tets that hardly any body has:
 
-    Arrays are NumPy's and read-only: `torch.tensor(mesh.vertices)` copies them without a warning, where
-    `torch.from_numpy` gives one.
+    - inner faces with both tets on one side (a folded mesh), - faces of three or more tets, - coincident faces without
+    common vertices, see `merged`, - coincident faces with other corners.
+
+    Separate components are no fault; `quality()` counts them. Arrays are NumPy's and read-only.
+    `torch.tensor(mesh.vertices)` copies one without a warning, where `torch.from_numpy` warns.
 
     Args:
         vertices: positions [V, 3] in m.
         tets: vertex numbers [E, 4].
-        fill: how much of each tet is material, in (0, 1] [E], or None for all of it: the lattice of `tetrahedralize`
+        fill: material fraction of each tet in (0, 1] [E], or None for full tets. The lattice of `tetrahedralize`
             reaches beyond its surface. `Solid` multiplies density and Young's modulus by it.
-        regions: a whole number for each tet [E], what it belongs to, or None. A material of each is
-            `Solid(mesh, youngs=np.where(mesh.regions == 2, 1e6, 1e5))`.
-        drop_unreferenced: leave out vertices that no tet uses (otherwise an error).
-        drop_degenerate: leave out tets whose volume is zero within rounding, that name a vertex twice, or that came
-            before (otherwise an error).
+        regions: whole number of the region of each tet [E], or None. A stiffness per region is `Solid(mesh,
+            youngs=np.where(mesh.regions == 2, 1e6, 1e5))`.
+        drop_unreferenced: drop vertices that no tet uses (otherwise an error).
+        drop_degenerate: drop tets of zero volume within rounding, with a repeated vertex, or that come twice (otherwise
+            an error).
     """
 
     vertices: Array
@@ -83,31 +83,32 @@ class TetMesh:
         fields = clean_tets(
             vertices, tets, fill, regions, drop_unreferenced=drop_unreferenced, drop_degenerate=drop_degenerate
         )
-        store(self, **fields, embedding=None)
+        set_frozen(self, **fields, embedding=None)
         report_faces(self.vertices, self.tets)
 
     @classmethod
     def from_file(cls, path: PathLike, *, unit: Unit | None = None, drop_degenerate: bool = False) -> TetMesh:
         """Read a volume mesh (.mesh, .msh, .vtk, .vtu, .inp, ...).
 
-        Hexahedra, wedges and pyramids are split into tets that fill them and match across faces; of cells of higher
-        order the corners are kept. Triangles of the file, the outer surface or another one inside, are carried along as
-        `embedding`; quads and polygons are split. Physical groups, references, element sets and attributes become
-        `regions`. What is left out, split or assumed a `MeshWarning` says.
+        Hexahedra, wedges and pyramids are split into tets that fill them and match across faces. Cells of higher order
+        keep their corners. Triangles of the file, on the outer surface or inside, become the `embedding`; quads and
+        polygons are split. Physical groups, references, element sets and attributes become `regions`. A `MeshWarning`
+        lists every omission, split and assumption.
 
         Args:
-            path: the file; the suffix of its name says in which format it is.
-            unit: "m", "cm", "mm", "in" or "ft", of the numbers in the file; they become metres. None: what the file
-                declares, or metres.
+            path: the file; its suffix selects the format.
+            unit: "m", "cm", "mm", "in" or "ft", the unit of the numbers in the file, which are converted to metres.
+                None: the unit that the file declares, or metres.
             drop_degenerate: as for a new mesh.
 
         Raises:
-            ValueError: the file cannot be read, or holds no such cells; with its name, its format and what was met.
+            ValueError: the file cannot be read, or holds no such cells; the error gives its name, its format and the
+                cause.
         """
         body = read_body("TetMesh.from_file", path, unit)
         if body.notes:
             warn(f"TetMesh.from_file: {Path(path).name}: {'; '.join(body.notes)}")
-        with naming("TetMesh.from_file", path):
+        with name_file_in_errors("TetMesh.from_file", path):
             mesh = cls(
                 body.points, body.tets, regions=body.regions, drop_unreferenced=True, drop_degenerate=drop_degenerate
             )
@@ -117,25 +118,25 @@ class TetMesh:
         used = np.unique(body.tets)
         if len(mesh.vertices) == len(used):
             return mesh.with_embedding(embed_triangles(mesh.vertices, mesh.tets, np.searchsorted(used, triangles)))
-        # tets without volume went, and vertices with them, so that some triangles hang on others
+        # dropping flat tets also dropped vertices, so some triangles need another tet
         return mesh.with_embedding(embed(TriMesh(body.points, triangles, drop_unreferenced=True), mesh))
 
     def to_file(self, path: PathLike) -> None:
-        """Write in the format of the file's suffix (.mesh, .msh, .vtk, .vtu, ...) through meshio.
+        """Write the mesh in the format of the file's suffix (.mesh, .msh, .vtk, .vtu, ...) through meshio.
 
-        Vertices and tets, and regions where the format has room for them, as those four do. What is left out a
-        `MeshWarning` says: regions elsewhere, an embedded surface and the fill.
+        The file holds vertices and tets, and regions in formats that store them, such as those four. A `MeshWarning`
+        lists the omissions: regions elsewhere, an embedded surface and the fill.
         """
         file, with_regions = write_tets(path, self.vertices, self.tets, self.regions)
         parts = {"the embedded surface": self.embedding, "the fill": self.fill}
         lost = [name for name, part in parts.items() if part is not None]
         if lost:
             warn(
-                f"TetMesh.to_file: {file.name} is without {' and '.join(lost)}, for which mesh files have no place; "
+                f"TetMesh.to_file: {file.name} omits {' and '.join(lost)}, which mesh files cannot hold; "
                 "Simulator.save keeps them, and mesh.embedding.surface.to_file(...) writes a surface"
             )
         if self.regions is not None and not with_regions:
-            warn(f"TetMesh.to_file: {file.name} is without the regions; .mesh, .msh, .vtk and .vtu keep them")
+            warn(f"TetMesh.to_file: {file.name} omits the regions; .mesh, .msh, .vtk and .vtu hold them")
 
     @property
     def bounds(self) -> Array:
@@ -143,7 +144,7 @@ class TetMesh:
         return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def boundary(self) -> Index:
-        """The faces that belong to one tet only, int64 [T, 3] into `vertices`, counter-clockwise seen from outside."""
+        """Boundary faces, int64 [T, 3] into `vertices`, counter-clockwise seen from outside: those of one tet only."""
         order, begins = match_faces(self.tets)
         ends = np.append(begins[1:], True)
         return np.asarray(self.tets[:, TET_FACES].reshape(-1, 3)[np.sort(order[begins & ends])])
@@ -153,7 +154,7 @@ class TetMesh:
         return measure_quality(self.vertices, self.tets, self.fill)
 
     def with_embedding(self, embedding: Embedding | None) -> TetMesh:
-        """The same mesh carrying another surface along (or none)."""
+        """Copy of the mesh with another embedded surface, or without one."""
         if embedding is not None and not (
             embedding.vertex_count == len(self.vertices)
             and embedding.tets.max(initial=-1) < len(self.tets)
@@ -164,19 +165,21 @@ class TetMesh:
                 "it names); make one with torchpd.embed(surface, mesh)"
             )
         mesh: TetMesh = object.__new__(TetMesh)
-        store(mesh, **(vars(self) | {"embedding": embedding}))
+        set_frozen(mesh, **(vars(self) | {"embedding": embedding}))
         return mesh
 
     def merged(self, tolerance: float | None = None, *, drop_degenerate: bool = False) -> TetMesh:
-        """The mesh with vertices at the same place made one, the first of them, so that tets that meet there share it.
+        """Copy of the mesh in which coincident vertices are one, so that adjacent tets share them.
+
+        The first vertex of each group stays.
 
         Args:
-            tolerance: vertices that hang together by distances up to this [m] become one; None is 4.8e-7 of the
-                diagonal of the bounding box, a few roundings of float32.
-            drop_degenerate: as for a new mesh: leave out tets that lose their volume, or that come twice.
+            tolerance: vertices connected by distances up to this [m] become one. None: 4.8e-7 of the bounding box
+                diagonal, a few roundings of float32.
+            drop_degenerate: as for a new mesh: drop tets that lose their volume, or that come twice.
 
         Raises:
-            ValueError: tets that lose their volume, or that come twice.
+            ValueError: tets lose their volume, or come twice.
         """
         reach = ROUNDING * float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
         if tolerance is not None:
@@ -197,21 +200,21 @@ class TetMesh:
         return mesh.with_embedding(embed(self.embedding.surface, mesh))
 
     def transformed(self, matrix: Numbers) -> TetMesh:
-        """The mesh and its embedded surface under x -> A x + b, from a 3x3 or 4x4 matrix; it may reflect."""
+        """Transform the mesh and its embedded surface by x -> A x + b, from a 3x3 or 4x4 matrix; it may reflect."""
         linear, offset = affine("TetMesh.transformed: matrix", matrix)
-        # A reflection inverts every tet: two corners change places, and with them their weights.
+        # A reflection inverts every tet: two corners and their weights change places.
         corners = [0, 1, 3, 2] if np.linalg.det(linear) < 0 else [0, 1, 2, 3]
-        mesh = trusted(self.vertices @ linear.T + offset, self.tets[:, corners], self.fill, self.regions)
+        mesh = without_face_checks(self.vertices @ linear.T + offset, self.tets[:, corners], self.fill, self.regions)
         if self.embedding is None:
             return mesh
         return mesh.with_embedding(self.embedding.transformed(matrix, corners))
 
     def translated(self, offset: Numbers) -> TetMesh:
-        """The mesh and its embedded surface moved by a vector [m]."""
+        """Translate the mesh and its embedded surface by a vector [m]."""
         return self.transformed(translation("TetMesh.translated: offset", offset))
 
     def scaled(self, factor: float | Numbers) -> TetMesh:
-        """The mesh and its embedded surface scaled about the origin, by one positive factor or one per axis."""
+        """Scale the mesh and its embedded surface about the origin, by one positive factor or one per axis."""
         return self.transformed(scaling("TetMesh.scaled: factor", factor))
 
     def __repr__(self) -> str:
@@ -223,18 +226,20 @@ class TetMesh:
         return f"TetMesh({len(self.vertices)} vertices, {len(self.tets)} tets{filled}{carried})"
 
 
-def trusted(vertices: Numbers, tets: Numbers, fill: Numbers | None = None, regions: Numbers | None = None) -> TetMesh:
-    """A mesh whose tets may meet as they do: of those that were looked at before, or that torchpd lets overlap."""
+def without_face_checks(
+    vertices: Numbers, tets: Numbers, fill: Numbers | None = None, regions: Numbers | None = None
+) -> TetMesh:
+    """Mesh without the check of its faces, for tets that were checked before or may overlap."""
     mesh: TetMesh = object.__new__(TetMesh)
-    store(mesh, **clean_tets(vertices, tets, fill, regions), embedding=None)
+    set_frozen(mesh, **clean_tets(vertices, tets, fill, regions), embedding=None)
     return mesh
 
 
 def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
-    """Embed a surface in any tetrahedral mesh: each vertex in the tet that contains it, or else the least distant one.
+    """Embed a surface in a tetrahedral mesh: each vertex in the tet that contains it, or else in the nearest one.
 
-    A vertex outside of the mesh is extrapolated, with negative weights. Where one is farther outside than its tet is
-    long, a `MeshWarning` says how far: a small strain of that tet moves it by more than the strain.
+    A vertex outside of the mesh is extrapolated, with negative weights. A `MeshWarning` gives the largest distance of a
+    vertex farther outside than its tet is long: a strain of that tet moves it by more than the strain.
     """
     for name, value, kind in (("surface", surface, TriMesh), ("mesh", mesh, TetMesh)):
         if not isinstance(value, kind):

@@ -21,7 +21,7 @@ from .bcc_lattice import Lattice
 from .embedding import Embedding
 from .mesh_checks import warn
 from .mesh_faces import TET_FACES, match_faces
-from .occupancy import LEAST_FILL, Parts, inside_share, parts_of
+from .occupancy import MIN_FILL, Parts, inside_share, parts_of
 from .tet_mesh import TetMesh, embed
 from .tri_mesh import TriMesh
 
@@ -32,7 +32,7 @@ Index = NDArray[np.int64]
 
 # Vertices at open edges closer than this many cells count as one.
 _SEAM = 0.25
-# A share that may be rounding of none.
+# A material fraction within the rounding of zero.
 _HOLLOW = 1e-4
 
 
@@ -46,35 +46,35 @@ def tetrahedralize(
     fill_holes: bool = True,
     unit: Unit | None = None,
 ) -> TetMesh:
-    """A tetrahedral mesh around a surface, which carries the surface along as `mesh.embedding`.
+    """Fill a surface with tetrahedra; the result carries the surface as `mesh.embedding`.
 
     "lattice" takes any triangles: open, in pieces, self-intersecting, with either winding. It keeps the tets of a
-    body-centred cubic lattice that the surface reaches into or encloses. All tets are alike and well shaped; the mesh
-    reaches beyond the surface by up to one cell, and parts less than about a cell apart grow together. Cavities are
-    filled. Corners at open edges that are less than a quarter of a cell apart, and less than half of their edges, count
-    as one; triangles that come from both sides count once; holes are closed by cones, which a `MeshWarning` reports.
-    What encloses nothing, a sheet or what is torn beyond that, has no inside: another one says so. Parts of the mesh
-    that would hang together by an edge or a vertex alone are separated there.
+    body-centred cubic lattice that the surface intersects or encloses. All tets are congruent and well shaped. The mesh
+    reaches beyond the surface by up to one cell, and parts less than about a cell apart are joined. Cavities are
+    filled.
 
-    Of its volume, `mesh.fill` says which share of each tet lies inside of the surface. `Solid` multiplies density and
-    Young's modulus by it, so that a body weighs what the surface encloses (to 2 % and less; 3 % where it is about one
-    cell thick) and is about as stiff. No share is less than 0.05, for the solvers, and none makes a tet softer than a
-    tenth. What encloses nothing, a sheet or a surface that stays open, is a body of the tets that it passes: these are
-    full. For the whole lattice to be material, leave the shares out: `TetMesh(mesh.vertices,
+    Repairs of "lattice": corners at open edges count as one within a quarter of a cell and half of their edges.
+    Triangles that come from both sides count once. Cones close holes, with a `MeshWarning`. A sheet, or a surface that
+    stays open, encloses nothing; another warning reports it. Parts of the mesh that share only an edge or a vertex are
+    separated there.
+
+    `mesh.fill` is the fraction of each tet inside the surface. `Solid` multiplies density and Young's modulus by it. So
+    a body has the mass of the enclosed volume (to 2 % and less; 3 % if it is about one cell thick) and about its
+    stiffness. Fractions are at least 0.05, for the solvers, and the stiffness of a tet is at least a tenth. The tets
+    that a sheet passes are full. For full tets everywhere, leave the fractions out: `TetMesh(mesh.vertices,
     mesh.tets).with_embedding(mesh.embedding)`.
 
     "tetwild" follows the surface closely with tets of varying shape; it needs the package pytetwild.
 
     Args:
-        surface: a TriMesh, a trimesh.Trimesh or trimesh.Scene, or the path of a file (see
-            `TriMesh.from_file`).
-        cells: cells along the longest side of the bounding box; for "tetwild" the aim is edges as long as a cell.
+        surface: a TriMesh, a trimesh.Trimesh or trimesh.Scene, or the path of a file (see `TriMesh.from_file`).
+        cells: cells along the longest side of the bounding box; for "tetwild" the target edge length is a cell.
         method: "lattice" or "tetwild".
         progress: show a progress bar.
-        fill_holes: "lattice" counts what lies behind a hole as inside, up to a cone of triangles over the open edges.
-            False leaves whatever can be reached from outside empty: an open surface becomes a shell.
-        unit: "m", "cm", "mm", "in" or "ft", of the numbers of a file or a trimesh, see `TriMesh.from_file`. A TriMesh
-            is in metres.
+        fill_holes: "lattice" counts the space behind a hole as inside, up to a cone over the open edges. False leaves
+            all space reachable from outside empty: an open surface becomes a shell.
+        unit: "m", "cm", "mm", "in" or "ft", the unit of a file or a trimesh, see `TriMesh.from_file`. A TriMesh is in
+            metres.
     """
     triangles = _as_surface(surface, unit)
     if check_scalar("tetrahedralize: cells", cells, minimum=1) != int(cells):
@@ -97,7 +97,7 @@ def _as_surface(surface: Any, unit: Unit | None) -> TriMesh:
     if isinstance(surface, (str, os.PathLike)):
         return TriMesh.from_file(Path(surface), unit=unit)
     if isinstance(surface, TetMesh):
-        raise TypeError("tetrahedralize: surface must be a surface, got a TetMesh, which is filled already")
+        raise TypeError("tetrahedralize: surface must be a surface, got a TetMesh, which is already filled")
     import trimesh
 
     if isinstance(surface, (trimesh.Trimesh, trimesh.Scene)):
@@ -122,10 +122,10 @@ def _fill_lattice(surface: TriMesh, lattice: Lattice, *, progress: bool, fill_ho
     if fill_holes:
         _report_open(parts, solid, _SEAM * lattice.spacing)
     sheets = np.concatenate([parts.sheets, parts.triangles[~solid[parts.part]]])
-    # Around a sheet, which has no inside, the tets that it passes are the body.
+    # A sheet has no inside: the tets that it passes are the body.
     whole = inner | lattice.touched(sheets) if len(sheets) else inner
     share[whole] = 1.0
-    # Walls that the surface touches from within, in a face, an edge or a vertex, would be one more layer outside.
+    # Surface tets that the surface only touches from within would add a layer outside.
     hollow = walls & (share < _HOLLOW)
     kept = (walls | inner) & (~hollow | lattice.entered(np.concatenate([corners, parts.caps]), hollow))
     numbers, weights = lattice.locate_among(surface.vertices, kept)
@@ -133,7 +133,7 @@ def _fill_lattice(surface: TriMesh, lattice: Lattice, *, progress: bool, fill_ho
     chosen = np.flatnonzero(kept)
     vertices, tets = lattice.mesh(chosen)
     source, tets = _split_hinges(tets)
-    mesh = TetMesh(vertices[source], tets, fill=np.clip(share.reshape(-1)[chosen], LEAST_FILL, 1.0))
+    mesh = TetMesh(vertices[source], tets, fill=np.clip(share.reshape(-1)[chosen], MIN_FILL, 1.0))
     carriers = np.searchsorted(chosen, numbers)
     return mesh.with_embedding(Embedding(surface, carriers, weights, mesh.tets[carriers], len(mesh.vertices)))
 
@@ -143,7 +143,7 @@ def _report_open(parts: Parts, solid: NDArray[np.bool_], tolerance: float) -> No
 
     Args:
         parts: of a surface whose holes are closed.
-        solid: which of them enclose a volume [P].
+        solid: mask of parts that enclose a volume [P].
         tolerance: of `parts_of` [m].
     """
     total = parts.own + len(parts.sheets)
@@ -154,8 +154,8 @@ def _report_open(parts: Parts, solid: NDArray[np.bool_], tolerance: float) -> No
         warn(
             f"tetrahedralize: {sheets} of {total} triangles are a sheet, open or flat, which encloses nothing; "
             f"{of_edges}. The mesh is full where they pass, about a cell thick, and heavier than a thin sheet. To fill "
-            f"an inside, close the surface: corners less than {tolerance:.3g} m and half an edge apart count as one; "
-            "repair what is farther apart, or use fewer cells"
+            f"an inside, close the surface: corners less than {tolerance:.3g} m and half an edge apart count as one. "
+            "Repair wider gaps, or use fewer cells"
         )
     sides = parts.triangles[:, 1:] - parts.triangles[:, :1]
     area = np.where(solid[parts.part], np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1), 0.0)
@@ -170,10 +170,10 @@ def _report_open(parts: Parts, solid: NDArray[np.bool_], tolerance: float) -> No
 
 
 def _split_hinges(tets: Index) -> tuple[Index, Index]:
-    """Give every fan of tets around a vertex a vertex of its own: a fan hangs together by faces.
+    """Duplicate vertices so that the tets around each vertex are connected by faces.
 
-    Returns the old vertex of each new one, and the tets with new corners. Parts that met in an edge or a vertex alone,
-    a joint without stiffness, come apart; all other vertices keep their order. Only vertices of boundary faces can be
+    Returns the old vertex of each new one, and the tets with new corners. Parts that shared only an edge or a vertex, a
+    joint without stiffness, are separated. All other vertices keep their order. Only vertices of boundary faces can be
     such joints.
     """
     order, begins = match_faces(tets)
@@ -193,7 +193,7 @@ def _split_hinges(tets: Index) -> tuple[Index, Index]:
     rows, columns = sides[0][at_boundary], sides[1][at_boundary]
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(tets.size, tets.size))
     fan = connected_components(graph, directed=False)[1].astype(np.int64)
-    # Inner vertices are one fan by themselves: key every fan by its vertex first, which also keeps the order.
+    # An inner vertex has one fan. Keys sort by vertex first, which keeps the order.
     fan[~outer[vertex]] = 0
     keys = vertex * tets.size + fan
     _, first, renumbered = np.unique(keys, return_index=True, return_inverse=True)
@@ -209,7 +209,7 @@ def _fill_tetwild(surface: TriMesh, edge_length: float) -> TetMesh:
             f'(import failed: {error}); method="lattice" needs nothing'
         ) from error
     low, high = surface.bounds
-    # fTetWild leaves a file of this name in the working directory: take it away, unless it was there before.
+    # fTetWild leaves a file of this name in the working directory: delete it, unless it existed before.
     leftover = Path("__tracked_surface.stl")
     is_ours = not leftover.exists()
     try:
@@ -221,7 +221,7 @@ def _fill_tetwild(surface: TriMesh, edge_length: float) -> TetMesh:
     finally:
         if is_ours:
             leftover.unlink(missing_ok=True)
-    # fTetWild lists corners in either order; turning them here is no repair to be reported.
+    # fTetWild lists corners in either order; turning them is no repair to report.
     edges = vertices[tets[:, 1:]] - vertices[tets[:, :1]]
     inverted = np.linalg.det(edges) < 0
     tets = tets.astype(np.int64)

@@ -1,4 +1,4 @@
-"""Triangle surfaces: frozen vertices and indices that have been checked, to be carried along, drawn or filled."""
+"""Triangle surfaces: immutable and checked, for embedding, rendering or filling."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..common.checks import as_array, check_finite, check_shape
 from ..common.synonyms import check_arguments
 from ..common.units import Unit, metres
 from ..formats.bodies import read_surface
-from ..formats.guard import naming
+from ..formats.guard import name_file_in_errors
 from .mesh_checks import (
     Numbers,
     affine,
@@ -22,9 +22,9 @@ from .mesh_checks import (
     check_points,
     compact,
     has_repeated_corner,
-    refuse,
+    raise_for_first,
     scaling,
-    store,
+    set_frozen,
     translation,
     warn,
 )
@@ -38,14 +38,14 @@ PathLike = str | os.PathLike[str]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TriMesh:
-    """A triangle surface, open or closed, of one or many pieces. Triangles without area are accepted.
+    """A triangle surface, open or closed, of one or more components. Triangles without area are accepted.
 
     Args:
         vertices: positions [V, 3] in m.
         triangles: vertex numbers [T, 3], counter-clockwise seen from outside.
         uvs: texture coordinates [V, 2], or None.
-        drop_unreferenced: leave out vertices that no triangle uses (otherwise an error).
-        drop_degenerate: leave out triangles that name a vertex twice (otherwise an error).
+        drop_unreferenced: drop vertices that no triangle uses (otherwise an error).
+        drop_degenerate: drop triangles with a repeated vertex (otherwise an error).
     """
 
     vertices: Array
@@ -70,14 +70,16 @@ class TriMesh:
             elements, bad = elements[~bad], bad[~bad]
             if not len(elements):
                 raise ValueError("TriMesh.triangles: no triangle has three different corners")
-        refuse("TriMesh.triangles", bad, elements, "corners must differ", "pass drop_degenerate=True to leave them out")
+        raise_for_first(
+            "TriMesh.triangles", bad, elements, "corners must differ", "pass drop_degenerate=True to leave them out"
+        )
         coordinates = None
         if uvs is not None:
             coordinates = as_array("TriMesh.uvs", uvs, np.float64)
             check_shape("TriMesh.uvs", coordinates, (len(points), 2), "texture coordinates of every vertex")
             check_finite("TriMesh.uvs", coordinates)
         kept, elements = compact("TriMesh", elements, len(points), drop=drop_unreferenced)
-        store(
+        set_frozen(
             self,
             vertices=points[kept],
             triangles=elements,
@@ -86,9 +88,9 @@ class TriMesh:
 
     @classmethod
     def from_trimesh(cls, surface: Any, *, unit: Unit | None = None) -> TriMesh:
-        """From a trimesh.Trimesh, or from a trimesh.Scene with all its geometry in place.
+        """Convert a trimesh.Trimesh, or a trimesh.Scene with its geometry in place.
 
-        `unit`, as in `from_file`, is that of its numbers; what `surface.units` says is not looked at.
+        `unit` is the unit of its numbers, as in `from_file`; `surface.units` is ignored.
         """
         import trimesh
 
@@ -97,7 +99,7 @@ class TriMesh:
                 type(part).__name__ for part in surface.geometry.values() if not isinstance(part, trimesh.Trimesh)
             ]
             if others:
-                warn(f"TriMesh.from_trimesh: left out, for they have no triangles: {', '.join(sorted(others))}")
+                warn(f"TriMesh.from_trimesh: geometry without triangles left out: {', '.join(sorted(others))}")
             surface = surface.to_mesh()
         if not isinstance(surface, trimesh.Trimesh):
             raise TypeError(f"TriMesh.from_trimesh: surface must be a Trimesh or a Scene, got {type(surface).__name__}")
@@ -113,32 +115,33 @@ class TriMesh:
     def from_file(cls, path: PathLike, *, unit: Unit | None = None) -> TriMesh:
         """Read the triangles of a mesh file; quads and polygons become triangles.
 
-        Surfaces: .obj, .ply, .stl, .off, .gltf, .glb, .dae, .3mf, and through usd-core .usd, .usda, .usdc, .usdz. Of a
-        volume mesh the triangles that it lists are read. What is left out, or assumed, a `MeshWarning` says.
+        Surfaces: .obj, .ply, .stl, .off, .gltf, .glb, .dae, .3mf, and through usd-core .usd, .usda, .usdc, .usdz. For a
+        volume mesh, the triangles that the file lists are read. A `MeshWarning` lists every omission and assumption.
 
-        All objects of a file are read, and parts of a scene where its transforms put them. Declared units become
-        metres, and a declared axis that is up becomes y (.usd, .dae; of .3mf the unit only, where it is a millimetre
-        unless it says otherwise). Vertices keep the order of the file; one with several texture coordinates is doubled,
-        and equal corners of an .stl become one vertex.
+        All objects of a file are read, each at the place that the scene's transforms give. Declared units become
+        metres, and a declared up axis becomes y (.usd, .dae). For .3mf the unit is converted only; its default is the
+        millimetre. Vertices keep the order of the file. A vertex with several texture coordinates is duplicated, and
+        equal corners of an .stl are merged.
 
         Args:
-            path: the file; the suffix of its name says in which format it is.
-            unit: "m", "cm", "mm", "in" or "ft", of the numbers in the file; they become metres. None: what the file
-                declares, or metres.
+            path: the file; its suffix selects the format.
+            unit: "m", "cm", "mm", "in" or "ft", the unit of the numbers in the file, which are converted to metres.
+                None: the unit that the file declares, or metres.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ModuleNotFoundError: the format needs a package that is not installed, which is named.
-            ValueError: the file cannot be read, or holds no triangles; with its name, its format and what was met.
+            ModuleNotFoundError: the format needs a package that is not installed; the error names it.
+            ValueError: the file cannot be read, or holds no triangles; the error gives its name, its format and the
+                cause.
         """
         surface = read_surface("TriMesh.from_file", path, unit)
         if surface.notes:
             warn(f"TriMesh.from_file: {Path(path).name}: {'; '.join(surface.notes)}")
-        with naming("TriMesh.from_file", path):
+        with name_file_in_errors("TriMesh.from_file", path):
             return cls(surface.points, surface.triangles, uvs=surface.uvs, drop_unreferenced=True, drop_degenerate=True)
 
     def to_trimesh(self) -> Any:
-        """A trimesh.Trimesh with the same vertices, faces and texture coordinates."""
+        """Convert to a trimesh.Trimesh with the same vertices, faces and texture coordinates."""
         import trimesh
 
         surface: Any = trimesh.Trimesh(self.vertices, self.triangles, process=False)
@@ -148,7 +151,7 @@ class TriMesh:
         return surface
 
     def to_file(self, path: PathLike) -> None:
-        """Write in the format of the file's suffix, through trimesh."""
+        """Write the surface in the format of the file's suffix, through trimesh."""
         self.to_trimesh().export(Path(path))
 
     @property
@@ -162,17 +165,17 @@ class TriMesh:
         return float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0)
 
     def transformed(self, matrix: Numbers) -> TriMesh:
-        """The surface under x -> A x + b, from a 3x3 or 4x4 matrix; a reflection turns the triangles round."""
+        """Transform the surface by x -> A x + b, from a 3x3 or 4x4 matrix; a reflection reverses the triangles."""
         linear, offset = affine("TriMesh.transformed: matrix", matrix)
         triangles = self.triangles[:, ::-1] if np.linalg.det(linear) < 0 else self.triangles
         return TriMesh(self.vertices @ linear.T + offset, triangles, uvs=self.uvs)
 
     def translated(self, offset: Numbers) -> TriMesh:
-        """The surface moved by a vector [m]."""
+        """Translate the surface by a vector [m]."""
         return self.transformed(translation("TriMesh.translated: offset", offset))
 
     def scaled(self, factor: float | Numbers) -> TriMesh:
-        """The surface scaled about the origin, by one positive factor or one per axis."""
+        """Scale the surface about the origin, by one positive factor or one per axis."""
         return self.transformed(scaling("TriMesh.scaled: factor", factor))
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""Which points inside a surface see each other: segments and rays against all of its triangles."""
+"""Visibility between points inside a surface: segments and rays against all of its triangles."""
 
 from __future__ import annotations
 
@@ -9,28 +9,29 @@ __all__ = ["depths", "is_blocked"]
 
 Array = NDArray[np.float64]
 
-_AT_ONCE = 4_000_000  # pairs of a ray and a triangle
-_TOUCH = 1e-9  # of a barycentric coordinate: rays through an edge count
+_AT_ONCE = 4_000_000  # ray-triangle pairs processed at a time
+_TOUCH = 1e-9  # tolerance of a barycentric coordinate: rays through an edge count
 
 
 def _first_hits(origins: Array, directions: Array, corners: Array, *, least: float, most: float) -> Array:
-    """The least t in (least, most) with origin + t direction on a triangle [n], inf where there is none.
+    """Least t in (least, most) with origin + t direction on a triangle [n]; inf without a hit.
 
-    Every ray against the ball around every triangle [T, 3, 3], and against those triangles whose ball it meets.
+    Tests every ray against the bounding sphere of every triangle [T, 3, 3], then against the triangles of the spheres
+    that it meets.
     """
     first = np.full(len(origins), np.inf)
     shift = corners.mean(axis=(0, 1))  # far from the origin, squares would lose digits
     origins, corners = origins - shift, corners - shift
-    middle = corners.mean(axis=1)
-    radius = 1.001 * np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    centroid = corners.mean(axis=1)
+    radius = 1.001 * np.linalg.norm(corners - centroid[:, None], axis=2).max(axis=1)
     length = np.linalg.norm(directions, axis=1)
     rows = max(1, _AT_ONCE // len(corners))
     for start in range(0, len(origins), rows):
         o, d, size = origins[start : start + rows], directions[start : start + rows], length[start : start + rows]
         unit = d / size[:, None]
-        along = unit @ middle.T - (unit * o).sum(axis=1)[:, None]
-        # the square of the distance from the ray, at least zero but for rounding that the margin of the radius covers
-        apart = (o**2).sum(axis=1)[:, None] + (middle**2).sum(axis=1) - 2.0 * (o @ middle.T) - along**2
+        along = unit @ centroid.T - (unit * o).sum(axis=1)[:, None]
+        # squared distance from the ray; rounding below zero is covered by the margin of the radius
+        apart = (o**2).sum(axis=1)[:, None] + (centroid**2).sum(axis=1) - 2.0 * (o @ centroid.T) - along**2
         near = (apart <= radius**2) & (along >= -radius) & (along <= most * size[:, None] + radius)
         ray, triangle = np.nonzero(near)
         hits = _hits(o[ray], d[ray], corners[triangle])
@@ -40,7 +41,7 @@ def _first_hits(origins: Array, directions: Array, corners: Array, *, least: flo
 
 
 def _hits(origins: Array, directions: Array, corners: Array) -> Array:
-    """Where each ray [n, 3] meets its triangle [n, 3, 3], from both sides; inf where it does not.
+    """Distance along each ray [n, 3] to its triangle [n, 3, 3], from both sides; inf without a hit.
 
     Moeller and Trumbore (1997).
     """
@@ -55,9 +56,9 @@ def _hits(origins: Array, directions: Array, corners: Array) -> Array:
 
 
 def depths(points: Array, directions: Array, corners: Array) -> Array:
-    """How far it is from points [n, 3] on a surface along unit directions [n, 3] to its other side [n] in m.
+    """Thickness of a surface [n] in m: distance from points [n, 3] along unit directions [n, 3] to the other side.
 
-    Zero where nothing is hit: sides closer together than 1e-6 of the surface's size count as one.
+    Zero without a hit: sides closer together than 1e-6 of the surface's size count as one.
     """
     diagonal = float(np.linalg.norm(np.ptp(corners.reshape(-1, 3), axis=0)))
     first = _first_hits(points, directions, corners, least=1e-6 * diagonal, most=diagonal)

@@ -1,20 +1,20 @@
 """Gradients through a time step by the implicit function theorem.
 
-At a converged step r(x') = a (x' - x - s) + dE/dx'(x') = 0 on the vertices that move, so for a loss L(x', v')
+At a converged step r(x') = a (x' - x - s) + dE/dx'(x') = 0 on the free vertices. For a loss L(x', v')
 
-    H l = dL/dx' + dL/dv' / h,     dL/dp = -l . dr/dp          for every input p of the step,
+    H l = dL/dx' + dL/dv' / h,     dL/dp = -l . dr/dp          for every input p of the step.
 
-H the exact Hessian of the step's objective (the rotations' derivative included), solved by conjugate gradients with
-the weighted diagonal, or with the multilevel preconditioner of a plan that has one: `Multilevel` makes it, and any
-solver with `Simulator(adjoint="multilevel")`. The error of the gradient follows
-the error of the step: iterate far enough, and look at the residual.
+H is the exact Hessian of the step objective, including the derivative of the rotations. Conjugate gradients solve the
+system, preconditioned by the weighted diagonal or by the multilevel preconditioner of the plan. `Multilevel` builds the
+latter, and any solver with `Simulator(adjoint="multilevel")`. The error of the gradient follows the error of the step:
+iterate far enough, and check the residual.
 
-A GPU solves every environment in one launch, however many iterations it takes (of half a million vertices and more in a
-few, as many as the plan and batch ask for), so a CUDA graph can record it. An environment that is done does nothing.
+A GPU solves every environment in one launch for any number of iterations, so a CUDA graph can record it. Meshes of half
+a million vertices and more take a few launches, fixed by the plan and batch. A converged environment does no work.
 
-Contacts: the normal direction of a vertex that a contact holds is taken out of the system; a vertex that friction holds
-moves with its start, on a ball about its centre. Where vertices slide against friction the system is not symmetric:
-csrc/solver/adjoint/friction.h. What contacts themselves get stands in csrc/solver/adjoint/contact_gradients.h.
+Contacts: the normal direction of a touching vertex is removed from the system. A sticking vertex moves with its start,
+on a sphere about the centre of that sphere. Sliding friction makes the system unsymmetric
+(csrc/solver/adjoint/friction.h). Gradients of the contacts themselves are in csrc/solver/adjoint/contact_gradients.h.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ __all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "is_recording", "mend_adjoint", "
 
 # see csrc/solver/adjoint/system.h
 ADJOINT_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_tolerance, strict=True))
-# A body stretched this much turns so little that its Hessian is the constant, positive majoriser but for 1e-4.
+# At this stretch the rotations hardly change, so the Hessian equals the constant, positive majoriser within 1e-4.
 _STRETCH = 1e4
 
 
 @dataclass(frozen=True)
 class AdjointCall:
-    """A step that was taken: its inputs, and the positions that it reached."""
+    """Inputs of a step, and the positions after it."""
 
     positions: Tensor  # x [B, V, 3]
     velocities: Tensor  # v
@@ -51,7 +51,7 @@ class AdjointCall:
 
 
 def is_recording(tensor: Tensor) -> bool:
-    """Whether what is done with a tensor is recorded for a CUDA graph, where nobody can ask what comes out."""
+    """Whether a CUDA graph records the work on a tensor, so that no value may be read."""
     if not tensor.is_cuda:
         return False
     with torch.cuda.device(tensor.device):
@@ -65,7 +65,7 @@ def _inertial(material: dict[str, Tensor], time_step: float) -> Tensor:
 
 
 def step_gradient(call: AdjointCall) -> Tensor:
-    """Gradient of the step's objective at `call.after` [B, V, 3] N; contacts do not enter, hard pins have none.
+    """Gradient of the step objective at `call.after` [B, V, 3] N, without contacts; zero at hard pins.
 
     m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + springs + elastic gradient.
     """
@@ -84,20 +84,20 @@ def step_gradient(call: AdjointCall) -> Tensor:
     return torch.where(held > 0, torch.zeros_like(gradient), gradient)
 
 
-def _warn_of(failed: Tensor, error: Tensor) -> None:
+def _warn_of_no_solution(failed: Tensor, error: Tensor) -> None:
     warn_user(
         f"torchpd: the adjoint of a step has no solution in {int(failed.sum())} of {len(failed)} environments "
-        f"(relative residual {float(error[failed].max()):.1e}): their states are far from an equilibrium (more "
+        f"(relative residual {float(error[failed].max()):.1e}). Their states are far from an equilibrium (more "
         "iterations in the step help), at an unstable one, or have negative stiffness or masses. Their gradients "
-        "take the rotations as constant.",
+        "treat the rotations as constant.",
     )
 
 
 def _warn_of_friction(failed: Tensor, error: Tensor) -> None:
     warn_user(
-        f"torchpd: the adjoint of a step in which vertices slide is not solved in {int(failed.sum())} of "
-        f"{len(failed)} environments (relative residual {float(error[failed].max()):.1e}): friction jams there. Their "
-        "gradients are approximate."
+        f"torchpd: the adjoint of a step with sliding friction is not solved in {int(failed.sum())} of {len(failed)} "
+        f"environments (relative residual {float(error[failed].max()):.1e}), where friction jams. Their gradients are "
+        "approximate."
     )
 
 
@@ -114,21 +114,21 @@ def mend_adjoint(
     *,
     time_step: float,
 ) -> Tensor:
-    """The multiplier l [B, V, 3]: where H turned out not to be positive that of constant rotations, with a warning.
+    """Multiplier l [B, V, 3]; where H is not positive definite, that of constant rotations, with a warning.
 
-    A warning says too where the system with friction is not solved: `solution` stays there. While a CUDA graph records,
-    nobody can ask whether a solve has failed, and there is no warning.
+    A second warning tells of an unsolved system with friction, whose approximate `solution` stays. While a CUDA graph
+    records, failures cannot be read: there is no warning.
 
     Args:
-        solution: the multiplier that was found [B, V, 3].
-        error: the relative residual of the system with H [B].
-        friction: that of the system with friction [B], without contacts None.
+        solution: multiplier found by the solver [B, V, 3].
+        error: relative residual of the system with H [B].
+        friction: relative residual of the system with friction [B]; None without contacts.
         after: x' [B, V, 3].
-        right: right side on what moves [B, V, 3].
-        inverse: 1 / D, 0 where a vertex does not move, [V] or [B, V].
-        projector: of what contacts let through [B, V, 3, 3].
+        right: right side, zero at vertices that do not move [B, V, 3].
+        inverse: 1 / D, 0 at vertices that do not move, [V] or [B, V].
+        projector: contact projector [B, V, 3, 3].
         material: of the step.
-        plan: of its scene.
+        plan: of the scene.
         time_step: h [s].
     """
     arrays, tolerance = list(plan), ADJOINT_TOLERANCE[right.dtype]
@@ -139,8 +139,8 @@ def mend_adjoint(
             _warn_of_friction(friction > limit, friction)
         if not bool(failed.any()):
             return solution.clone()
-        _warn_of(failed, error)
-    # the curvature of what is slid on has no part in the majoriser
+        _warn_of_no_solution(failed, error)
+    # the curvature of contact surfaces is no part of the majoriser
     inertia, _ = step_diagonal(arrays, material, time_step)
     instead, _ = torch.ops.torchpd.conjugate_gradients(
         _STRETCH * after,

@@ -1,4 +1,4 @@
-"""Inertia and diagonal of every vertex, for estimates and preconditioners: a step computes its own."""
+"""Inertia and diagonal of every vertex, for estimates and preconditioners; a step computes its own."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ __all__ = ["named_material", "pinned_vertices", "step_diagonal"]
 
 
 def named_material(arrays: Sequence[Tensor]) -> dict[str, Tensor]:
-    """The material's arrays by name."""
+    """Material arrays by name."""
     return {row.name: array for row, array in zip(MATERIAL_TABLE, arrays, strict=True)}
 
 
 def pinned_vertices(plan: Sequence[Tensor]) -> Tensor:
-    """User's number of each pinned vertex [P]."""
+    """Number of each pinned vertex in the user's order [P]."""
     _, vertex_order, pin_vertex, *_ = plan
     return vertex_order[pin_vertex.long()].long()
 
@@ -26,7 +26,7 @@ def pinned_vertices(plan: Sequence[Tensor]) -> Tensor:
 def step_diagonal(
     plan: Sequence[Tensor], material_arrays: Sequence[Tensor], time_step: float, *, weighted: bool = True
 ) -> tuple[Tensor, Tensor]:
-    """Inertia a and diagonal D of every vertex, [V] or [B, V], in N/m; infinite on hard pins.
+    """Inertia a and diagonal D of every vertex, [V] or [B, V], in N/m; inf at hard pins.
 
     a_i = m_i / h^2 (1 + damping h) + k_i;  D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted.
     """

@@ -17,7 +17,7 @@ from .diagonal import named_material
 from .vmap import register_rule
 from .vmap_step import rollout_vjp_rule, step_vjp_rule
 
-__all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_tangents"]
+__all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_forward_mode"]
 
 INFO_WIDTH = _C.info_numbers
 
@@ -28,27 +28,32 @@ _STIFFNESS = [row.name for row in MATERIAL_TABLE].index("stiffness")
 def nearest_rotation(F: Tensor) -> Tensor:
     """The rotation R nearest to each matrix: argmax of tr(R^T F) over det R = +1.
 
-    Safe for inverted, rank-deficient, huge and tiny matrices: zero gives the identity, a matrix with NaN or infinity
-    gives NaN. Differentiable, of matrices of 1e-12 to 1e12 (in float64 1e-101 to 1e101), infinitely steep where the two
-    smallest singular values cancel (with the sign of det F on the smallest): there the nearest rotation jumps.
+    Safe for inverted, rank-deficient, huge and tiny matrices. Zero gives the identity; a matrix with NaN or infinity
+    gives NaN. Differentiable for matrices of magnitude 1e-12 to 1e12 (float64: 1e-101 to 1e101). The derivative is
+    unbounded where the two smallest singular values cancel (with the sign of det F on the smallest): there the nearest
+    rotation jumps.
 
-    Largest root of Davenport's quartic (Markley 1993), closed form, one Newton polish; signed SVD where roots meet.
+    Method: largest root of Davenport's quartic (Markley 1993) in closed form, and one Newton step; signed SVD near
+    double roots.
 
     Args:
         F: float32 or float64 [..., 3, 3].
 
     Returns:
         [..., 3, 3].
+
+    Raises:
+        TypeError: F is not a tensor.
     """
     if not isinstance(F, Tensor):
         raise TypeError(f"nearest_rotation: F must be a tensor [..., 3, 3], got {type(F).__name__}")
-    refuse_tangents(F)
+    refuse_forward_mode(F)
     result: Tensor = _ops.nearest_rotation(F)
     return result
 
 
-def refuse_tangents(*tensors: Tensor | None) -> None:
-    """The ops have no forward-mode derivatives, and torch would take them to be zero."""
+def refuse_forward_mode(*tensors: Tensor | None) -> None:
+    """Refuse forward-mode derivatives, which the ops lack: torch would take them to be zero."""
     if forward_ad._current_level < 0:
         return
     for tensor in tensors:
@@ -62,7 +67,10 @@ def refuse_tangents(*tensors: Tensor | None) -> None:
 
 
 def _register_fake(name: str) -> Callable[[Callable[..., Any]], None]:
-    """Torch also takes a fake kernel where one argument of several is on "meta", and would return unwritten memory."""
+    """Register a fake kernel that refuses arguments partly on "meta".
+
+    Torch also takes a fake kernel when one argument of several is on "meta", and would return uninitialised memory.
+    """
 
     def register(kernel: Callable[..., Any]) -> None:
         def checked(*given: Any, **settings: Any) -> Any:
@@ -134,7 +142,7 @@ def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
     batch, vertices, _ = positions.shape
     rows = list(zip(MATERIAL_TABLE, material, strict=True))
     touching = any(row.name in ("planes", "spheres") and array.shape[-2] > 0 for row, array in rows)
-    # those that inertia and diagonal come from
+    # arrays that inertia and diagonal depend on
     own = touching or any(
         row.name in ("stiffness", "masses", "damping", "pin_stiffness")
         and array.dim() > row.dims
@@ -217,13 +225,13 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
 
 
 def _save_elastic(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-    """Of an op of a state, a material and a plan."""
+    """Save the inputs of an op of a state, a material and a plan."""
     *state, material, ctx.plan = inputs
     ctx.save_for_backward(*state, *material)
 
 
-def _like_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
-    """The derivative for a stiffness that all environments share is the sum over them."""
+def _sum_to_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
+    """Sum over the environments that share a stiffness."""
     return per_environment.sum(0) if stiffness.dim() == 1 else per_environment.sum_to_size(stiffness.shape)
 
 
@@ -232,12 +240,12 @@ def _with_stiffness(material: Sequence[Tensor], stiffness: Tensor) -> list[Tenso
 
 
 def _for_material(stiffness: Tensor | None) -> list[Tensor | None]:
-    """The other arrays have no part in elastic energy."""
+    """Gradients of the material rows: only stiffness enters the elastic energy."""
     return [stiffness if row.name == "stiffness" else None for row in MATERIAL_TABLE]
 
 
 def _for_plan(ctx: Any) -> list[None]:
-    """The plan has no derivative; autograd wants to hear so for every array of it."""
+    """No gradient for any array of the plan, in the form that autograd expects."""
     return [None] * len(ctx.plan)
 
 
@@ -248,7 +256,7 @@ def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, lis
         x = _ops.gradient(positions, _with_stiffness(material, grad * stiffness), ctx.plan)
     if ctx.needs_input_grad[1][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
-        w = _like_stiffness(grad * _ops.element_energy(positions, unit, ctx.plan), stiffness)
+        w = _sum_to_stiffness(grad * _ops.element_energy(positions, unit, ctx.plan), stiffness)
     return x, _for_material(w), _for_plan(ctx)
 
 
@@ -259,7 +267,7 @@ def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tens
         x = _ops.hessian_product(positions, grad, material, ctx.plan)
     if ctx.needs_input_grad[1][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
-        w = _like_stiffness(_ops.element_energy_product(positions, grad, unit, ctx.plan), stiffness)
+        w = _sum_to_stiffness(_ops.element_energy_product(positions, grad, unit, ctx.plan), stiffness)
     return x, _for_material(w), _for_plan(ctx)
 
 
@@ -275,7 +283,7 @@ def _element_energy_product_backward(
         d = _ops.gradient(positions, scaled, ctx.plan)
     if ctx.needs_input_grad[2][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
-        w = _like_stiffness(grad * _ops.element_energy_product(positions, direction, unit, ctx.plan), stiffness)
+        w = _sum_to_stiffness(grad * _ops.element_energy_product(positions, direction, unit, ctx.plan), stiffness)
     return x, d, _for_material(w), _for_plan(ctx)
 
 
@@ -306,19 +314,22 @@ def _precondition_setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
 
 
 def _precondition_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, list[None]]:
-    # it is linear and symmetric
+    # the preconditioner is linear and symmetric
     return _ops.precondition(grad, ctx.plan), _for_plan(ctx)
 
 
 def _rotation_differential(F: Tensor, direction: Tensor) -> Tensor:
-    """dR along dF from torch operations, R [h]_x with (tr(S) I - S) h = axis(R^T dF): differentiable once more."""
+    """Differential dR along dF from torch operations, so that it is differentiable again.
+
+    R [h]_x with (tr(S) I - S) h = axis(R^T dF).
+    """
     R = nearest_rotation(F)
     S = R.mT @ F
     A = R.mT @ direction
     axis = torch.stack((A[..., 2, 1] - A[..., 1, 2], A[..., 0, 2] - A[..., 2, 0], A[..., 1, 0] - A[..., 0, 1]), dim=-1)
     S = 0.5 * (S + S.mT)
     trace = S.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    # a singular matrix has no derivative, and says so in its own result: nothing is checked, which would wait for a GPU
+    # A singular matrix gives inf or NaN; a check would wait for the GPU.
     turning = trace * torch.eye(3, dtype=F.dtype, device=F.device) - S
     x, y, z = torch.linalg.solve_ex(turning, axis)[0].unbind(-1)
     zero = torch.zeros_like(x)
@@ -334,7 +345,7 @@ def _rotation_backward(ctx: Any, grad: Tensor) -> Tensor:
 
 
 def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-    # in the precision of F, also where autocast asks for less
+    # in the precision of F, also under autocast
     with torch.enable_grad(), torch.autocast(grad.device.type, enabled=False):
         inputs = [saved.detach().requires_grad_() for saved in ctx.saved_tensors]
         grads: tuple[Tensor | None, ...] = torch.autograd.grad(_rotation_differential(*inputs), inputs, grad)

@@ -1,8 +1,8 @@
-"""Registers the rules for vmap with both that torch has.
+"""Registration of vmap rules with both implementations of torch.
 
-`torch.vmap` finds rules by the key of functorch. `torch.autograd.grad(is_grads_batched=True)`, and with it
-`torch.autograd.functional.jacobian` and `hessian` with `vectorize=True`, run an older vmap of their own, whose tensors
-have another key and which knows nothing of the rules of the first.
+`torch.vmap` uses the functorch dispatch key. `torch.autograd.grad(is_grads_batched=True)` runs an older implementation
+with another key, which ignores the rules of the first. So do `torch.autograd.functional.jacobian` and `hessian` with
+`vectorize=True`.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from torch.utils import _pytree as pytree
 
 __all__ = ["Rule", "register_rule"]
 
-Rule = Callable[..., tuple[Any, int]]  # of info, in_dims and arguments: the outputs, and where all of them are mapped
+Rule = Callable[..., tuple[Any, int]]  # from info, in_dims and arguments to the outputs and their mapped dimension
 
-# Its functions are private; without them `torch.vmap` is what there is.
+# its functions are private; without them only `torch.vmap` works
 _is_mapped: Any = getattr(getattr(torch._C, "_functorch", None), "is_legacy_batchedtensor", None)
 _OLDER = _is_mapped is not None and all(hasattr(torch, name) for name in ("_add_batch_dim", "_remove_batch_dim"))
 _LIBRARY = torch.library.Library("torchpd", "IMPL")
 
 
 def register_rule(name: str, rule: Rule) -> None:
-    """Make an op of torchpd follow a rule, see `torch.library.register_vmap`."""
+    """Register a vmap rule for an op of torchpd, see `torch.library.register_vmap`."""
     torch.library.register_vmap(f"torchpd::{name}", rule)
     if _OLDER:
         _LIBRARY.impl(name, _for_older_vmap(rule), "Batched")
@@ -47,12 +47,12 @@ def _for_older_vmap(rule: Rule) -> Callable[..., Any]:
 
 
 def _without(tensor: Tensor, level: int) -> Tensor:
-    """A mapped tensor with the dimension of a level in front; still mapped if that is not its only one."""
+    """Unwrap one level of a mapped tensor, its dimension in front; outer levels stay mapped."""
     return torch._remove_batch_dim(tensor, level, 1, 0)
 
 
 def _level_of(tensor: Tensor) -> int:
-    """Found by trial: the count that torch keeps is that of a thread, and autograd has others for a GPU."""
+    """Find the level by trial: torch counts levels per thread, and autograd has other threads for a GPU."""
     for level in range(1, 9):
         if not _is_mapped(_without(tensor, level)):
             return level

@@ -1,4 +1,4 @@
-"""Rules for vmap: the mapped dimension joins the leading batch that the ops have anyway."""
+"""Rules for vmap: the mapped dimension joins the leading batch of the ops."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ _OWN = {row.name: row.dims for row in MATERIAL_TABLE}  # dimensions of an array 
 
 
 def _shape_of_one(tensor: Tensor, dim: int | None) -> torch.Size:
-    """The shape that the mapped function sees."""
+    """Shape of one map, as the mapped function sees it."""
     return torch.Size(length for place, length in enumerate(tensor.shape) if place != dim)
 
 
 def _check_one(fits: bool, op: Any, in_dims: Any, args: Any, **numbers: Any) -> None:
-    """What does not fit is refused by the op itself, of one map: in all together it may fit by chance."""
+    """Run the op on one map if its shape is wrong, so that the op raises its error: joined, it may be valid."""
     if not fits:
         op(*pytree.tree_map(lambda t, dim: t if dim is None else t.select(dim, 0), args, in_dims), **numbers)
 
 
 def _join(tensor: Tensor, dim: int | None, size: int, batch: int, own: int) -> Tensor:
-    """Merge a mapped dimension into the leading batch of an array that has `own` dimensions without one.
+    """Merge a mapped dimension into the leading batch of an array with `own` dimensions without a batch.
 
-    Shared arrays stay shared; an array for each of `batch` environments is repeated for each of the `size` maps.
+    Shared arrays stay shared. An array for each of `batch` environments is repeated for each of the `size` maps.
     """
     if dim is None:
         shared = tensor.dim() == own or (len(tensor) == 1 and batch > 1)
@@ -49,7 +49,7 @@ def _check_plan(dims: Any) -> None:
 
 
 def _fits(state: Sequence[torch.Size], material: Mapping[str, torch.Size]) -> bool:
-    """Whether arrays of a state are [batch, V, 3], and those of the material for that batch or for all."""
+    """Whether state arrays are [batch, V, 3], and material arrays suit that batch or are shared."""
     batch, *_ = *state[0], 0
     return all(len(shape) == 3 and shape == state[0] for shape in state) and all(
         len(shape) == _OWN[name] or (len(shape) == _OWN[name] + 1 and shape[0] in (1, batch))
@@ -60,9 +60,10 @@ def _fits(state: Sequence[torch.Size], material: Mapping[str, torch.Size]) -> bo
 def _join_all(
     op: Any, info: Any, in_dims: Any, args: Any, tracks: int = 0, read: Iterable[str] = _OWN, **numbers: Any
 ) -> tuple[list[Any], tuple[int, int]]:
-    """The arguments (arrays of a state, material, plan) of all maps in one call; how many maps and environments.
+    """Join the arguments (state arrays, material, plan) of all maps, and count maps and environments.
 
-    The first `tracks` arguments are of all steps, [step, batch, V, 3]. Of the material the op reads what is in `read`.
+    The first `tracks` arguments hold all steps, [step, batch, V, 3]. `read` names the material arrays that the op
+    reads.
     """
     *state, material, plan = args
     *state_dims, material_dims, plan_dims = in_dims
@@ -92,7 +93,7 @@ def _join_all(
 
 
 def _batch_rule(name: str, dim: int = 0, read: Iterable[str] = _OWN) -> Rule:
-    """For an op that has its batch at `dim` of everything that it returns, and reads these arrays of the material."""
+    """Rule for an op whose outputs have their batch at `dim`; `read` names the material arrays that it reads."""
     op = getattr(_ops, name)
 
     def rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[Any, int]:
@@ -103,12 +104,12 @@ def _batch_rule(name: str, dim: int = 0, read: Iterable[str] = _OWN) -> Rule:
 
 
 def step_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
-    """The adjoint of a step. An array that environments share has a gradient for each map, the sum over its own."""
+    """Rule for the adjoint of a step. The gradient of a shared array sums over the environments of each map."""
     return _vjp_rule(_ops.step_vjp, info, in_dims, args, **numbers)
 
 
 def rollout_vjp_rule(info: Any, in_dims: Any, *args: Any, **numbers: Any) -> tuple[list[Tensor], int]:
-    """The adjoint of a rollout, whose gradients and states come first, of all steps."""
+    """Rule for the adjoint of a rollout; its gradients and states come first and hold all steps."""
     return _vjp_rule(_ops.rollout_vjp, info, in_dims, args, tracks=4, **numbers)
 
 

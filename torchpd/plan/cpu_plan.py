@@ -1,4 +1,4 @@
-"""The plan: everything about a scene that does not change from step to step, compiled once into flat tensors."""
+"""The plan of a scene: its constant arrays (order, partition, weights), compiled once into flat tensors."""
 
 from __future__ import annotations
 
@@ -21,41 +21,46 @@ from ..scene.scene import SceneValues
 __all__ = [
     "KERNELS",
     "Plan",
-    "any_of",
     "compile_plan",
-    "compiling",
+    "compile_progress",
     "internal_numbers",
     "kernel_of",
     "loose_pieces",
+    "quoted_choices",
     "with_loose_components",
 ]
 
-_WORTH_A_BAR = 200_000  # tetrahedra from which compiling takes long enough to show progress
-# by their number in the `sizes` of a GPU's plan
+_WORTH_A_BAR = 200_000  # tetrahedra from which a progress bar is shown
+# in the order of their numbers in the `sizes` of a GPU plan
 KERNELS = ("block", "cluster", "grid", "stream")
-_SIZE_GROUPS = 3  # as in csrc/views/views.h
+_SIZE_GROUPS = 3  # place in PlanSize of csrc/views/views.h
 
 
 def kernel_of(arrays: Sequence[Tensor]) -> str:
-    """Which kernel the arrays of a GPU's plan are for."""
+    """Name of the kernel that the arrays of a GPU plan were compiled for."""
     sizes, *_ = arrays
     return KERNELS[int(sizes[DEVICE_SIZES.index("kernel")])]
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Constant arrays of a scene in the order of a table that C++ declares, also by name: `plan.vertex_order`.
+    """The constant arrays of a scene, in the order of a C++ table and by name, as in `plan.vertex_order`.
 
-    The CPU and GPUs have a table each, which that of a multilevel preconditioner may follow. `why` says in words why a
-    GPU's plan is for the kernel that it is for; `for_levels`: its patches are those of a multilevel solver, and `many`
-    those for so many environments that each has few multiprocessors. `loose`: whether each connected piece of the scene
-    is one that a step moves rigidly, None where nobody says; what hard pins clamp is not.
+    The CPU and the GPU have a table each. The arrays of a multilevel preconditioner, if present, follow at the end.
+
+    Args:
+        arrays: the tensors, one for each row of `table`.
+        table: the rows that C++ declares.
+        why: reason for the choice of the GPU kernel, shown to the user.
+        for_multilevel: whether the patches were sized for a multilevel solver.
+        many: whether they were sized for so many environments that each has few multiprocessors.
+        loose: [components] whether a step may move a connected component rigidly (hard pins prevent it); None: unknown.
     """
 
     arrays: tuple[Tensor, ...]
     table: tuple[PlanRow, ...] = PLAN_TABLE
     why: str = ""
-    for_levels: bool = False
+    for_multilevel: bool = False
     many: bool = False
     loose: NDArray[np.bool_] | None = None
 
@@ -73,11 +78,11 @@ class Plan:
 
     @property
     def kernel(self) -> str | None:
-        """Which kernel of a GPU the plan is for: "block", "cluster", "grid" or "stream"; None for the CPU."""
+        """Name of the GPU kernel that the plan is for: "block", "cluster", "grid" or "stream"; None on the CPU."""
         return kernel_of(self.arrays) if self.table[: len(DEVICE_PLAN_TABLE)] == DEVICE_PLAN_TABLE else None
 
     def size(self, name: str) -> int:
-        """A number of a GPU's plan by its name in DEVICE_SIZES."""
+        """A size of a GPU plan by its name in DEVICE_SIZES."""
         return int(self.sizes[DEVICE_SIZES.index(name)])
 
     @property
@@ -87,34 +92,37 @@ class Plan:
 
     @property
     def device(self) -> torch.device:
-        """Where the arrays are."""
+        """Device of the arrays."""
         return self.vertex_order.device
 
     @property
     def vertices(self) -> int:
-        """Vertices of all bodies."""
+        """Number of vertices of all bodies."""
         return len(self.vertex_order)
 
     @property
     def patches(self) -> int:
-        """Patches of the mesh: the CPU works on one at a time, a GPU has a thread block for each."""
+        """Number of mesh patches. The CPU processes one at a time; a GPU has a thread block for each."""
         return len(self.patch_block) - 1
 
     @property
     def bytes(self) -> int:
-        """Memory of all arrays."""
+        """Memory of all arrays in bytes."""
         return sum(array.numel() * array.element_size() for array in self.arrays)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Plan:
-        """A copy on another device or, of a plan for the CPU, in another precision. Widening brings no digits back.
+        """Copy the plan to another device or, on the CPU, to another precision.
 
-        The kernels of a GPU and of the CPU need different plans: `Simulator.to` compiles the right one. `sizes` stay on
-        the CPU: the host reads them, and must not wait for a device.
+        The CPU and the GPU need different plans: `Simulator.to` compiles the right one. Widening to float64 does not
+        restore lost digits. `sizes` stay on the CPU, so that the host reads them without waiting for the device.
+
+        Raises:
+            ValueError: another precision for a GPU plan.
         """
         if self.kernel is not None and dtype not in (None, self.dtype):
             raise ValueError(
-                f"Plan.to: the plan of a GPU has other arrays in another precision: compile it for {dtype}, "
-                f"as sim.to({dtype}) does; got a plan in {self.dtype}"
+                f"Plan.to: dtype must be {self.dtype} for a GPU plan, got {dtype}; sim.to({dtype}) compiles the plan "
+                "again"
             )
 
         def moved(row: PlanRow, array: Tensor) -> Tensor:
@@ -126,8 +134,8 @@ class Plan:
 
 
 @contextmanager
-def compiling(tets: int, progress: bool) -> Iterator[Callable[[float], None]]:
-    """Shows a bar when the mesh is large; gives the function that hears the fraction done."""
+def compile_progress(tets: int, progress: bool) -> Iterator[Callable[[float], None]]:
+    """Show a progress bar for a large mesh; yields a callback that takes the fraction done."""
     with tqdm(total=100, desc="compiling the scene", leave=False, disable=not progress or tets < _WORTH_A_BAR) as bar:
         yield lambda done: _advance(bar, done)
 
@@ -137,32 +145,32 @@ def _advance(bar: tqdm[Any], done: float) -> None:
 
 
 def _patch_size(tets: int) -> int:
-    """Tetrahedra a patch: what fits the cache, in a number of patches that two or four threads can share evenly.
+    """Tetrahedra per patch: small enough for the cache, in a patch count that two or four threads share evenly.
 
-    Larger patches share fewer vertices (1.6 slots a vertex at 1024, 1.4 at 2048).
+    Larger patches share fewer vertices: 1.6 slots per vertex at 1024 tetrahedra, 1.4 at 2048.
     """
     patches = max(1, -(-tets // 2048))
     patches = -(-patches // 4) * 4 if tets >= 1024 else min(2, max(1, tets // 256))
     return max(16, -(-tets // patches))
 
 
-def any_of(names: Sequence[str]) -> str:
-    """Names of kernels as a sentence has them: "block", "grid" or "stream"."""
+def quoted_choices(names: Sequence[str]) -> str:
+    """Join names into a choice for an error message: "block", "grid" or "stream"."""
     *before, last = (f'"{name}"' for name in names)
     return f"{', '.join(before)} or {last}" if before else last
 
 
 def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Number of the piece that each vertex moves rigidly with (-1: none), and how many vertices each one has."""
+    """Number of the rigidly moving component of each vertex [V] (-1: none), and the vertex count of each one."""
     number = np.where(values.loose, np.cumsum(values.loose) - 1, -1)
     group = number[values.component].astype(np.int32)
     return group, np.bincount(group[group >= 0], minlength=int(values.loose.sum())).astype(np.int32)
 
 
 def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
-    """The plan of a CPU where other pieces of the scene can move rigidly."""
+    """Copy of a CPU plan for another set of components that a step may move rigidly."""
     if plan.kernel is not None:
-        raise ValueError("with_loose_components: a GPU's plan has its pieces in other arrays; compile it anew")
+        raise ValueError("with_loose_components: plan must be a CPU plan, got a GPU plan; compile it again")
     group, group_size = (tensor_of(array) for array in loose_pieces(values))
     sizes = plan.sizes.clone()
     sizes[_SIZE_GROUPS] = len(group_size)
@@ -172,7 +180,7 @@ def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
 
 
 def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
-    """Counts in the order of PlanSize in csrc/views/views.h."""
+    """Counts of a CPU plan, in the order of PlanSize in csrc/views/views.h."""
     slots = np.diff(arrays["patch_slot"])
     counts = (
         len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), len(arrays["group_size"]),
@@ -182,7 +190,7 @@ def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
 
 
 def internal_numbers(vertex_order: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Internal number of each of the user's vertices."""
+    """Internal number of each vertex in the user's order [V]."""
     internal = np.empty_like(vertex_order)
     internal[vertex_order] = np.arange(len(vertex_order), dtype=vertex_order.dtype)
     return internal
@@ -191,18 +199,18 @@ def internal_numbers(vertex_order: NDArray[np.int32]) -> NDArray[np.int32]:
 def compile_plan(
     values: SceneValues, *, dtype: torch.dtype = torch.float32, patch_size: int | None = None, progress: bool = True
 ) -> Plan:
-    """Order, partition and weigh a scene for the kernels. On the CPU; move it with `Plan.to`.
+    """Order, partition and weight a scene for the CPU kernels. `Plan.to` moves the result.
 
     Args:
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
-        patch_size: tetrahedra a patch, 16 to 8192; None chooses by the size of the mesh.
+        patch_size: tetrahedra per patch, 16 to 8192; None chooses by mesh size.
         progress: show a bar when the mesh is large.
     """
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
     tets = len(values.tets)
-    with compiling(tets, progress) as advance:
+    with compile_progress(tets, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_plan(
             values.rest_positions,
             values.tets,

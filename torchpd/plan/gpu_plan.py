@@ -1,4 +1,4 @@
-"""The plan of a GPU: the constant arrays of a scene in the form that its kernels read."""
+"""Compilation of the GPU plan: the constant arrays of a scene in the layout of the GPU kernels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .. import _C
 from ..common.checks import tensor_of
 from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 from ..scene.scene import SceneValues
-from .cpu_plan import KERNELS, compiling, internal_numbers, loose_pieces
+from .cpu_plan import KERNELS, compile_progress, internal_numbers, loose_pieces
 
 __all__ = ["compile_device_plan"]
 
@@ -23,15 +23,14 @@ _SIZE_PINS = DEVICE_SIZES.index("pins")
 def compile_device_plan(
     values: SceneValues, patches: int, kernel: int, dtype: torch.dtype, progress: bool = True
 ) -> tuple[Tensor, ...]:
-    """Order, partition and weigh a scene for the kernels of a GPU.
+    """Order, partition and weight a scene for the GPU kernels.
 
     Args:
         values: the flat arrays of `Scene.values`.
-        patches: parts of the mesh that one thread block each works on, 1 to the number of tetrahedra, of a cluster to
-            that of vertices and to 16; more are needed when a patch has more numbers than 16 bits count, from about
-            20 000 tetrahedra on.
-        kernel: 0 when one thread block steps a whole environment, 1 when a cluster of them does, 2 when a grid does,
-            3 for kernels per iteration.
+        patches: number of mesh patches, one thread block each: 1 to the number of tetrahedra. A cluster takes at most
+            16 and at most the number of vertices. Indices in a patch have 16 bits, so about 20 000 tetrahedra need a
+            second patch.
+        kernel: 0 (block), 1 (cluster), 2 (grid) or 3 (stream), the index into `KERNELS`.
         dtype: torch.float32 or torch.float64.
         progress: show a bar when the mesh is large.
 
@@ -43,7 +42,7 @@ def compile_device_plan(
     if kernel not in range(len(KERNELS)):
         raise ValueError(f"kernel must be 0, 1, 2 or 3, got {kernel}")
     piece, _ = loose_pieces(values)
-    with compiling(len(values.tets), progress) as advance:
+    with compile_progress(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
             values.rest_positions, values.tets, patches, kernel, dtype == torch.float32, piece, advance
         )

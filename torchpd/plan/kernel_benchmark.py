@@ -1,7 +1,7 @@
-"""`kernel="benchmark"`: every kernel that fits takes a few steps, once, and the quickest is kept.
+"""`kernel="benchmark"`: time a few steps with every kernel that fits, and keep the fastest.
 
-Times are kept while the process lives, by GPU, sizes of the scene, batch and iterations, as cuDNN's benchmark mode
-keeps its own. Kernels add up forces in different orders: bits depend on which of them is chosen, and so on the clock.
+The times are cached in the process by GPU, scene sizes, batch and iterations, as in the benchmark mode of cuDNN.
+Kernels sum forces in different orders, so the bits of a result depend on the kernel, and thus on the clock.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import torch
 from .compiled import CompiledScene
 from .cpu_plan import Plan
 
-__all__ = ["quickest_plan", "steps_of"]
+__all__ = ["benchmark_steps", "fastest_plan"]
 
 _REPETITIONS = 5
-_TIMES: dict[Hashable, dict[str, float]] = {}  # milliseconds of a step by kernel
+_TIMES: dict[Hashable, dict[str, float]] = {}  # milliseconds per step by kernel
 
 
-def steps_of(
+def benchmark_steps(
     scene: CompiledScene, dtype: torch.dtype, device: torch.device
 ) -> tuple[Hashable, Callable[[Plan], Callable[[], object]]]:
-    """`key` and `step` of `quickest_plan` for a scene on a GPU: what times depend on, and steps from rest."""
+    """Cache key and step function of `fastest_plan` for a scene on a GPU; steps start at rest."""
     values, batch = scene.scene.values(), scene.environments
     numbers = {
         **scene.solver.settings(),
@@ -49,29 +49,29 @@ def steps_of(
     return key, step
 
 
-def quickest_plan(plans: Iterator[Plan], key: Hashable, step: Callable[[Plan], Callable[[], object]]) -> Plan:
-    """The plan with the quickest steps.
+def fastest_plan(plans: Iterator[Plan], key: Hashable, step: Callable[[Plan], Callable[[], object]]) -> Plan:
+    """The plan with the fastest steps.
 
     Args:
         plans: one for every kernel that fits, on the CPU.
-        key: what the times depend on.
-        step: moves a plan to its GPU and returns what takes a step with it there; may raise
+        key: cache key of the times.
+        step: moves a plan to its GPU and returns a function that takes one step. It may raise
             `torch.cuda.OutOfMemoryError`.
     """
-    offers = list(plans)
+    candidates = list(plans)
     if key not in _TIMES:
-        _TIMES[key] = {str(plan.kernel): _milliseconds(step, plan) for plan in offers}
+        _TIMES[key] = {str(plan.kernel): _milliseconds(step, plan) for plan in candidates}
     times = _TIMES[key]
-    best = min(offers, key=lambda plan: times[str(plan.kernel)])
+    best = min(candidates, key=lambda plan: times[str(plan.kernel)])
     words = ", ".join(f"{kernel} {time:.3g} ms" for kernel, time in sorted(times.items(), key=lambda item: item[1]))
-    return replace(best, why=f"the quickest of those timed, milliseconds of a step: {words}")
+    return replace(best, why=f"the fastest kernel, milliseconds per step: {words}")
 
 
 def _milliseconds(step: Callable[[Plan], Callable[[], object]], plan: Plan) -> float:
-    """Of a step, median; inf where memory does not do."""
+    """Median milliseconds per step; inf if memory does not suffice."""
     try:
         run = step(plan)
-        run()  # a first one loads the kernel
+        run()  # the first step loads the kernel
         return statistics.median(_timed(run) for _ in range(_REPETITIONS))
     except torch.cuda.OutOfMemoryError:
         return float("inf")

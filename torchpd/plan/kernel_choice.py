@@ -1,21 +1,23 @@
-"""Which kernel of a GPU steps a scene, and the plan for it.
+"""Choice of the GPU kernel of a scene, and the plan for it.
 
-    block    one thread block an environment, or several small ones, all iterations in one launch: the mesh fits a
-             block's shared memory
-    cluster  up to 16 blocks that reach each other's shared memory (compute capability 9.0), a patch each, all
-             iterations in one launch: a small mesh
-    grid     a block for each of some patches, all iterations in one launch: the patches fit all multiprocessors
-    stream   launches for every iteration: any mesh
+    block    one thread block per environment, or several small environments per block. All iterations run in one
+             launch; the mesh fits the shared memory of a block.
+    cluster  up to 16 blocks that access each other's shared memory (compute capability 9.0), one patch each. All
+             iterations run in one launch; for small meshes.
+    grid     one block per patch. All iterations run in one launch; the patches fit the multiprocessors.
+    stream   launches for every iteration; for any mesh.
 
-Where the number of environments is known (`Simulator(batch=...)`), the kernel that fits and should take least is taken,
-by `kernel_costs`: a cluster for a few environments of a small mesh, launches for many of a large one, and between them
-a grid, of fewer and larger patches the more environments are to run at a time. "benchmark" times each that fits.
-Every vertex belongs to one patch of a cluster, and a patch has every tetrahedron that touches one of its own vertices:
-those at the borders are worked out by several. So no forces are exchanged, and once an iteration the new position of a
-vertex is sent into the shared memory of the patches that have a copy of it. Patches of the others share no tetrahedra,
-and exchange the forces on vertices that they share.
+With a known number of environments (`Simulator(batch=...)`), `kernel_costs` chooses among the kernels that fit. The
+estimate favours a cluster for few environments of a small mesh and "stream" for many of a large one. Between them it
+favours a grid, with fewer and larger patches the more environments run at a time. "benchmark" times every kernel that
+fits.
 
-The batch of a state does not enter: an environment gives the same bits alone and in any batch.
+A cluster assigns every vertex to one patch. A patch holds every tetrahedron that touches one of its own vertices, so
+tetrahedra at patch borders are computed more than once. Patches exchange no forces: once an iteration the new position
+of a vertex is written to the shared memory of the patches that hold a copy. The patches of the other kernels share no
+tetrahedra and exchange the forces on shared vertices.
+
+The batch of a state has no influence: an environment gives the same bits alone and in any batch.
 """
 
 from __future__ import annotations
@@ -32,66 +34,66 @@ from .. import _C
 from ..common.gpu import Properties
 from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 from ..scene.scene import SceneValues
-from .cpu_plan import KERNELS, Plan, any_of
+from .cpu_plan import KERNELS, Plan, quoted_choices
 from .gpu_plan import compile_device_plan
 from .kernel_costs import iteration_microseconds, kernel_microseconds
 
 __all__ = ["check_kernel", "choose_plan", "shared_bytes"]
 
-_GRID_TETS = 150  # a patch at least: smaller ones cost more in exchange than they save
-# "auto" looks at clusters for meshes of so many at most; where there are blocks, a patch of one for every so many
+_MIN_GRID_TETS = 150  # least per patch: smaller patches cost more in exchange than they save
+# "auto" tries clusters for meshes of up to 8000 tetrahedra, with one patch per 75 while there are blocks
 _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
-_CLUSTER_OWN = 0.7  # of the vertices that a block there has threads for, at most, while there are blocks to share them
-# with a multilevel solver environments are many where they have no more multiprocessors than so many each
+# largest share of the vertices that a block of a cluster has threads for, while there are more blocks
+_CLUSTER_OWN = 0.7
+# multilevel solver: environments are many if each has at most this number of multiprocessors
 _MANY_SHARE = 4
-# with a multilevel solver: a patch a multiprocessor of at least so many, or all in one block, of a mesh of so many at
-# most, fewer for few environments; many take less with fewer patches
-_LEVEL_TETS, _LEVEL_ALONE, _FEW_ALONE, _MANY_TETS = 384, 1152, 384, 1900
-_LEVELS = ("few", "any", "many")  # how many environments it is for
-# a patch at most, five rounds of its threads where all have partners, and how many patches share a multiprocessor of an
-# H100 (csrc/cuda/stream/kernels.h)
+# multilevel solver: least tetrahedra per patch; largest mesh in one block, in general and for few environments;
+# tetrahedra per patch for many environments, which run faster with fewer patches
+_MIN_LEVEL_TETS, _MAX_BLOCK_TETS, _MAX_BLOCK_TETS_FEW, _MANY_TETS = 384, 1152, 384, 1900
+_LEVELS = ("few", "any", "many")  # by the number of environments
+# Most tetrahedra per patch, five rounds of its threads when all are paired; and patches per multiprocessor of an H100
+# (csrc/cuda/stream/kernels.h).
 _STREAM_TETS = {torch.float32: 1920, torch.float64: 960}
-_STREAM_TOGETHER = {torch.float32: 2, torch.float64: 1}
-# so many times as many in a pipeline, of which a multiprocessor works on one at a time and holds two, where there is so
-# much shared memory for them and every multiprocessor has one: their slots are what its threads have in registers at
-# once (csrc/cuda/stream/pipeline.h)
-_PIPED_MORE, _PIPED_BYTES = 1.2, 200_000
-_MOST_FIELDS = 2  # of a pass: the products with a second derivative
+_STREAM_CONCURRENT = {torch.float32: 2, torch.float64: 1}
+# A pipeline takes patches larger by this factor: a multiprocessor computes one and holds two, if its shared memory
+# suffices and each has a patch. Its threads keep the slots in registers (csrc/cuda/stream/pipeline.h).
+_PIPELINE_GROWTH, _PIPELINE_BYTES = 1.2, 200_000
+_MAX_PASS_FIELDS = 2  # most fields of one pass: the products with a second derivative
 
 
 def check_kernel(kernel: str) -> str:
-    """The name of a kernel, "auto" or "benchmark"."""
+    """Return a kernel name after checking it: "auto", "benchmark" or one of KERNELS."""
     names = ("auto", "benchmark", *KERNELS)
     if kernel not in names:
-        raise ValueError(f"Simulator: kernel must be {any_of(names)}, got {kernel!r}")
+        raise ValueError(f"Simulator: kernel must be {quoted_choices(names)}, got {kernel!r}")
     return kernel
 
 
-def shared_bytes(plan: Plan, planes: int, balls: int) -> int:
-    """Shared memory of a block of the kernel that a plan is for."""
+def shared_bytes(plan: Plan, planes: int, spheres: int) -> int:
+    """Shared memory [bytes] per block of the kernel that a plan is for."""
     real = torch.finfo(plan.dtype).bits // 8
     slots, entries = plan.size("most_slots"), plan.size("most_entries")
-    if plan.for_levels:
+    if plan.for_multilevel:
         return _C.outer_shared_bytes(real, slots, entries)
     if plan.kernel == "stream":
         return _pass_bytes(plan)
     if plan.kernel == "cluster":
-        return _C.cluster_shared_bytes(real, slots, entries, plan.size("most_interior"), planes, balls)
-    return _C.fused_shared_bytes(real, plan.kernel == "grid", slots, entries, planes, balls)
+        return _C.cluster_shared_bytes(real, slots, entries, plan.size("most_interior"), planes, spheres)
+    return _C.fused_shared_bytes(real, plan.kernel == "grid", slots, entries, planes, spheres)
 
 
-def most_shared_bytes(plan: Plan, planes: int, balls: int) -> int:
-    """The same of whatever runs with a plan: a step, and the way back through it, which passes over all patches."""
-    return max(shared_bytes(plan, planes, balls), _pass_bytes(plan))
+def max_shared_bytes(plan: Plan, planes: int, spheres: int) -> int:
+    """Most shared memory [bytes] of a step and of its backward pass, which visits all patches."""
+    return max(shared_bytes(plan, planes, spheres), _pass_bytes(plan))
 
 
 def _pass_bytes(plan: Plan) -> int:
     real = torch.finfo(plan.dtype).bits // 8
-    bytes_of_pass = _C.pass_shared_bytes(real, plan.size("most_slots"), plan.size("most_entries"), _MOST_FIELDS)
+    bytes_of_pass = _C.pass_shared_bytes(real, plan.size("most_slots"), plan.size("most_entries"), _MAX_PASS_FIELDS)
     return bytes_of_pass + _C.pass_static_bytes
 
 
-class _Scene(NamedTuple):
+class _PlanBuilder(NamedTuple):
     values: SceneValues
     dtype: torch.dtype
     progress: bool
@@ -106,7 +108,7 @@ class _Scene(NamedTuple):
 
     @property
     def real(self) -> int:
-        """Bytes of a number."""
+        """Bytes of a real number."""
         return torch.finfo(self.dtype).bits // 8
 
     def plan(self, kernel: str, patches: int) -> Plan:
@@ -115,89 +117,91 @@ class _Scene(NamedTuple):
         return Plan(arrays, DEVICE_PLAN_TABLE, loose=self.values.loose)
 
     def shared_bytes(self, plan: Plan) -> int:
-        return most_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
+        return max_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
 
     def patches(self, kernel: str, gpu: Properties) -> int:
-        """By the name of a kernel, or for a multilevel solver "few", "many" or any other number of environments."""
+        """Number of patches for a kernel, or for a multilevel solver with "few", "many" or "any" environments."""
         if kernel == "block":
             return 1
         if kernel == "cluster":
-            wanted = max(2, self.tets // _CLUSTER_EACH, math.ceil(self.vertices / (_CLUSTER_OWN * self.most_own())))
+            wanted = max(
+                2, self.tets // _CLUSTER_EACH, math.ceil(self.vertices / (_CLUSTER_OWN * self.max_owned_vertices()))
+            )
             return min(gpu.cluster, gpu.multiprocessors, wanted, self.vertices, self.tets)
         if kernel == "grid":
-            return self.most_grid_patches(gpu)
+            return self.max_grid_patches(gpu)
         if kernel in _LEVELS:
-            if self.tets <= (_FEW_ALONE if kernel == "few" else _LEVEL_ALONE):
+            if self.tets <= (_MAX_BLOCK_TETS_FEW if kernel == "few" else _MAX_BLOCK_TETS):
                 return 1
-            # 2.5 entries and at least a third of a slot a tetrahedron, see pass_shared_bytes
+            # estimate: 2.5 entries and a third of a slot per tetrahedron, see pass_shared_bytes
             each = (4 * 2.5 + 6 / 3) * self.real
             least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.corotation_bytes))
             if kernel == "many":
                 return max(2, int(least), -(-self.tets // _MANY_TETS))
             rounds = -(-int(least) // gpu.multiprocessors)
-            return min(-(-self.tets // _LEVEL_TETS), rounds * gpu.multiprocessors)
+            return min(-(-self.tets // _MIN_LEVEL_TETS), rounds * gpu.multiprocessors)
         patches = -(-self.tets // _STREAM_TETS[self.dtype])
-        # what does not run at once runs in whole waves, of which the last is full too
-        wave = _STREAM_TOGETHER[self.dtype] * gpu.multiprocessors
-        if self.has_large_halves(gpu) and patches > gpu.multiprocessors:
+        # patches that do not run at once run in whole waves, of which the last is full too
+        wave = _STREAM_CONCURRENT[self.dtype] * gpu.multiprocessors
+        if self.uses_pipeline(gpu) and patches > gpu.multiprocessors:
             wave = gpu.multiprocessors
-            patches = max(wave, math.ceil(self.tets / (_PIPED_MORE * _STREAM_TETS[self.dtype])))
+            patches = max(wave, math.ceil(self.tets / (_PIPELINE_GROWTH * _STREAM_TETS[self.dtype])))
         return patches if patches <= wave else -(-patches // wave) * wave
 
-    def has_large_halves(self, gpu: Properties) -> bool:
-        """Whether iterations of kernel "stream" are a pipeline, in float32 and without contacts, with room for more."""
+    def uses_pipeline(self, gpu: Properties) -> bool:
+        """Whether "stream" runs as a pipeline with larger patches: float32, no contacts, enough shared memory."""
         touching = len(self.values.planes) + len(self.values.spheres) > 0
-        return self.dtype == torch.float32 and not touching and gpu.shared >= _PIPED_BYTES
+        return self.dtype == torch.float32 and not touching and gpu.shared >= _PIPELINE_BYTES
 
-    def most_grid_patches(self, gpu: Properties) -> int:
-        """Of a grid: as many as leave each its least number of tetrahedra."""
-        return min(gpu.multiprocessors, max(2, self.tets // _GRID_TETS), self.tets)
+    def max_grid_patches(self, gpu: Properties) -> int:
+        """Most patches of a grid that leave each one its least number of tetrahedra."""
+        return min(gpu.multiprocessors, max(2, self.tets // _MIN_GRID_TETS), self.tets)
 
-    def grids(self, batch: int, gpu: Properties) -> list[tuple[float, int]]:
-        """Times that an iteration of so many environments should take with numbers of patches, and these; best first.
+    def ranked_grids(self, batch: int, gpu: Properties) -> list[tuple[float, int]]:
+        """Estimated microseconds per iteration for each useful number of patches, in ascending order of time.
 
-        Of the numbers with which one environment, two, three... run at a time the largest.
+        For one, two, three... environments at a time, the largest number of patches is listed.
         """
-        most = self.most_grid_patches(gpu)
+        most = self.max_grid_patches(gpu)
         counts = {min(most, gpu.multiprocessors // together) for together in range(1, gpu.multiprocessors // 2 + 1)}
         timed = [(self.microseconds("grid", count, batch, gpu), count) for count in counts or {most}]
-        return sorted(timed, key=lambda offer: (offer[0], -offer[1]))
+        return sorted(timed, key=lambda candidate: (candidate[0], -candidate[1]))
 
     def microseconds(self, kernel: str, patches: int, batch: int, gpu: Properties) -> float:
         return kernel_microseconds(kernel, patches, self.tets, batch, self.dtype, gpu)
 
-    def most_own(self) -> int:
-        """Vertices that a block of a cluster has threads for."""
+    def max_owned_vertices(self) -> int:
+        """Most vertices that a block of a cluster has threads for."""
         return next(count - 1 for count in itertools.count(1) if not _C.fits_cluster(self.real, 1, count))
 
-    def considers(self, kernel: str, gpu: Properties) -> bool:
-        """Whether "auto" looks at a kernel."""
+    def is_candidate(self, kernel: str, gpu: Properties) -> bool:
+        """Whether "auto" considers a kernel."""
         return kernel != "cluster" or (gpu.cluster > 1 and self.tets <= _CLUSTER_TETS)
 
-    def refuse_unbuilt(self, kernel: str, patches: int, gpu: Properties) -> str:
-        """What is too much of a kernel whatever the plan, which need not be built then; empty where nothing is."""
-        tets = -(-self.tets // patches)  # one patch has so many, and in a cluster copies of others
+    def refuse_size(self, kernel: str, patches: int, gpu: Properties) -> str:
+        """Reason why a kernel cannot fit, found before the plan is built; empty if it may fit."""
+        tets = -(-self.tets // patches)  # least tetrahedra of the largest patch; a cluster adds copies
         if kernel == "cluster":
             return self.refuse_patch(-(-tets // 2), -(-self.vertices // patches))
         slots = self.vertices if patches == 1 else 4
-        planes, balls = len(self.values.planes), len(self.values.spheres)
+        planes, spheres = len(self.values.planes), len(self.values.spheres)
         # two tetrahedra have at least five entries
-        least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, 5 * tets // 2, planes, balls)
+        least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, 5 * tets // 2, planes, spheres)
         return f"at least {least:,} B" if least > gpu.shared else ""
 
     def refuse_patch(self, pairs: int, interior: int) -> str:
-        """Why a patch of a cluster is too large for the threads of a block; empty where it is not."""
+        """Reason why a patch of a cluster exceeds the threads of a block; empty if it fits."""
         if _C.fits_cluster(self.real, pairs, interior):
             return ""
         return f"patches smaller than {pairs} pairs of tetrahedra and {interior} vertices"
 
 
 def _fused_plan(
-    scene: _Scene, kernel: str, gpu: Properties, batch: int | None = None, patches: int | None = None
+    scene: _PlanBuilder, kernel: str, gpu: Properties, batch: int | None = None, patches: int | None = None
 ) -> tuple[Plan | None, str]:
-    """The plan, of so many patches if they are given, and what it needs; None where there is not as much."""
+    """The plan, None if it does not fit, and the shared memory that it needs, in words."""
     patches = scene.patches(kernel, gpu) if patches is None else patches
-    refusal = scene.refuse_unbuilt(kernel, patches, gpu)
+    refusal = scene.refuse_size(kernel, patches, gpu)
     if refusal:
         return None, refusal
     try:
@@ -215,12 +219,12 @@ def _fused_plan(
     return (plan if needed <= gpu.shared else None), f"{needed:,} B"
 
 
-def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan | None, str]:
-    """As `_fused_plan`, of as many patches as are best for so many environments, and fit."""
+def _grid_plan(scene: _PlanBuilder, gpu: Properties, batch: int | None) -> tuple[Plan | None, str]:
+    """As `_fused_plan` for a grid, with the fastest number of patches that fits."""
     if batch is None:
         return _fused_plan(scene, "grid", gpu)
     plan, needed, too_few = None, "", 0
-    for _, patches in scene.grids(batch, gpu):
+    for _, patches in scene.ranked_grids(batch, gpu):
         if patches <= too_few:
             continue
         plan, needed = _fused_plan(scene, "grid", gpu, patches=patches)
@@ -230,18 +234,18 @@ def _grid_plan(scene: _Scene, gpu: Properties, batch: int | None) -> tuple[Plan 
     return plan, needed
 
 
-def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan]:
-    """A plan for every kernel that fits, first the one that should take least for so many environments."""
-    cluster = _fused_plan(scene, "cluster", gpu)[0] if scene.considers("cluster", gpu) else None
-    offers = [
+def _plans_that_fit(scene: _PlanBuilder, gpu: Properties, batch: int) -> Iterator[Plan]:
+    """Plans of the kernels that fit, in ascending order of their estimated time."""
+    cluster = _fused_plan(scene, "cluster", gpu)[0] if scene.is_candidate("cluster", gpu) else None
+    candidates = [
         (scene.microseconds("block", 1, batch, gpu), "block", 1),
-        *((time, "grid", patches) for time, patches in scene.grids(batch, gpu)),
+        *((time, "grid", patches) for time, patches in scene.ranked_grids(batch, gpu)),
         (scene.microseconds("stream", 0, batch, gpu), "stream", 0),
     ]
     if cluster is not None:
-        offers.append((iteration_microseconds(cluster, scene.tets, batch, gpu), "cluster", cluster.patches))
+        candidates.append((iteration_microseconds(cluster, scene.tets, batch, gpu), "cluster", cluster.patches))
     done, too_few = set(), 0  # kernels; patches of a grid
-    for _, kernel, patches in sorted(offers, key=lambda offer: offer[0]):
+    for _, kernel, patches in sorted(candidates, key=lambda candidate: candidate[0]):
         if kernel in done or (kernel == "grid" and patches <= too_few):
             continue
         if kernel == "stream":
@@ -251,18 +255,18 @@ def _plans_that_fit(scene: _Scene, gpu: Properties, batch: int) -> Iterator[Plan
         if plan is not None:
             done.add(kernel)
             count = f"{batch} environment" + "s" * (batch != 1)
-            yield replace(plan, why=f"of the kernels that fit, expected to be the quickest for {count}")
+            yield replace(plan, why=f"the fastest kernel by estimate for {count}")
         elif kernel == "grid":
             too_few = patches
 
 
-def _stream_plan(scene: _Scene, gpu: Properties) -> Plan:
-    """More patches where many tetrahedra share a vertex, whose forces one patch sums."""
+def _stream_plan(scene: _PlanBuilder, gpu: Properties) -> Plan:
+    """Plan for "stream"; the number of patches doubles until the slots of each fit."""
     return _plan_that_fits(scene, gpu, "stream", lambda patches: 2 * patches)
 
 
-def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
-    """For a multilevel solver: as many patches for every multiprocessor, where one each is not enough."""
+def _level_plan(scene: _PlanBuilder, gpu: Properties, name: str) -> Plan:
+    """Plan for a multilevel solver; the number of patches stays a multiple of the multiprocessors."""
 
     def more(patches: int) -> int:
         if name == "many":
@@ -271,16 +275,16 @@ def _level_plan(scene: _Scene, gpu: Properties, name: str) -> Plan:
         return (rounds + 1 + rounds // 4) * gpu.multiprocessors
 
     plan = _plan_that_fits(scene, gpu, name, more)
-    return replace(plan, many=name == "many", why="what Multilevel runs with")
+    return replace(plan, many=name == "many", why="the kernel of Multilevel")
 
 
-def _plan_that_fits(scene: _Scene, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
-    """For "stream" or a multilevel solver; `more`: the patches to try after so many with too many slots or forces."""
+def _plan_that_fits(scene: _PlanBuilder, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
+    """Plan for "stream" or a multilevel solver; `more` gives the next number of patches to try."""
     patches = min(scene.patches(name, gpu), scene.tets)
     while True:
         try:
-            plan = replace(scene.plan("stream", patches), for_levels=name != "stream")
-        except ValueError:  # more in a patch than can be counted
+            plan = replace(scene.plan("stream", patches), for_multilevel=name != "stream")
+        except ValueError:  # more entries in a patch than 16 bits count
             if patches == scene.tets:
                 raise
         else:
@@ -298,62 +302,61 @@ def choose_plan(
     levels: bool = False,
     batch: int | None = None,
     progress: bool = True,
-    quickest: Callable[[Iterator[Plan]], Plan] = next,
+    fastest: Callable[[Iterator[Plan]], Plan] = next,
 ) -> Plan:
-    """The plan of a scene for a GPU, on the CPU; move it with `Plan.to`.
+    """Compile the plan of a scene for a GPU. The result is on the CPU; `Plan.to` moves it.
 
     Args:
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
-        gpu: what the device has.
-        kernel: "auto" takes the first of "block", "cluster", "grid" and "stream" that fits, and where the batch is
-            known the one that `kernel_costs` expects to be the quickest; a "cluster" where the GPU has them, and for
-            a small mesh alone. "benchmark" takes the one that `quickest` returns.
-        levels: for a multilevel solver, which runs as "stream" does but for its iterations.
-        batch: environments that a step will have; None: not known, which is between few and many.
+        gpu: properties of the device.
+        kernel: a name, "benchmark" (`fastest` chooses), or "auto": the fastest by `kernel_costs` if the batch is
+            known, else the first of "block", "cluster", "grid", "stream" that fits. "auto" uses a cluster only for a
+            small mesh.
+        levels: for a multilevel solver, which runs as "stream" except for its iterations.
+        batch: number of environments of a step; None: unknown, treated as between few and many.
         progress: show a bar when the mesh is large.
-        quickest: for "benchmark": takes a plan for every kernel that fits, see `kernel_benchmark`.
+        fastest: for "benchmark": chooses among a plan for every kernel that fits, see `kernel_benchmark`.
     """
     check_kernel(kernel)
-    scene = _Scene(values, dtype, progress)
+    scene = _PlanBuilder(values, dtype, progress)
     size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
     if levels:
         if kernel not in ("auto", "benchmark", "stream"):
             raise ValueError(
-                f'Simulator: Multilevel runs with kernel="stream" on a GPU, got kernel={kernel!r}; leave it at "auto"'
+                f'Simulator: kernel must be "stream" for Multilevel on a GPU, got {kernel!r}; leave it at "auto"'
             )
         return _level_plan(scene, gpu, size)
     if kernel == "cluster" and gpu.cluster == 1:
         raise ValueError(
-            'Simulator: kernel="cluster" needs thread blocks that reach each other\'s shared memory (NVIDIA compute '
-            'capability 9.0), and this GPU has none; take "block", "grid" or "stream", or "auto", which takes one '
-            "that fits"
+            'Simulator: kernel="cluster" needs thread block clusters (NVIDIA compute capability 9.0), and this GPU has '
+            'none; take "auto", "block", "grid" or "stream"'
         )
     if kernel == "benchmark":
-        return quickest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
+        return fastest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
     if kernel == "auto" and batch is not None:
         return next(_plans_that_fit(scene, gpu, batch))
-    needs = []
+    requirements = []
     for name in ("block", "cluster", "grid"):
-        if kernel != name and not (kernel == "auto" and scene.considers(name, gpu)):
+        if kernel != name and not (kernel == "auto" and scene.is_candidate(name, gpu)):
             continue
         plan, needed = _grid_plan(scene, gpu, batch) if name == "grid" else _fused_plan(scene, name, gpu, batch)
-        needs.append(f"{name} needs {needed}")
+        requirements.append(f"{name} needs {needed}")
         if plan is not None:
-            return replace(plan, why=_reason(kernel, needs, gpu))
+            return replace(plan, why=_choice_reason(kernel, requirements, gpu))
         if kernel == name:
-            # those that come later need less
-            others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.considers(other, gpu)]
+            # later kernels need less
+            others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.is_candidate(other, gpu)]
             raise ValueError(
-                f"Simulator: kernel={kernel!r} does not fit this GPU: {_facts(needs, gpu)}; take {any_of(others)}, or "
-                '"auto", which takes one that fits'
+                f"Simulator: kernel={kernel!r} does not fit this GPU: {_requirements(requirements, gpu)}; "
+                f"take {quoted_choices(('auto', *others))}"
             )
-    return replace(_stream_plan(scene, gpu), why=_reason(kernel, needs, gpu))
+    return replace(_stream_plan(scene, gpu), why=_choice_reason(kernel, requirements, gpu))
 
 
-def _reason(kernel: str, needs: list[str], gpu: Properties) -> str:
-    return "asked for" if kernel != "auto" else _facts(needs, gpu)
+def _choice_reason(kernel: str, requirements: list[str], gpu: Properties) -> str:
+    return "asked for" if kernel != "auto" else _requirements(requirements, gpu)
 
 
-def _facts(needs: list[str], gpu: Properties) -> str:
-    return f"shared memory a thread block: {', '.join(needs)}, {gpu.shared:,} B are there"
+def _requirements(requirements: list[str], gpu: Properties) -> str:
+    return f"shared memory per thread block: {', '.join(requirements)}, {gpu.shared:,} B are available"

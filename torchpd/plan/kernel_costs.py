@@ -1,12 +1,15 @@
-"""About how long an iteration takes with each kernel of a GPU, from seven numbers: the rule behind `kernel="auto"`.
+"""Estimated time of an iteration with each GPU kernel, from seven numbers: the rule behind `kernel="auto"`.
 
-    time = turns (latency + rate tets),   tets: those of one environment on its busiest multiprocessor
+    time = turns (latency + rate tets)
 
-A multiprocessor takes `rate` microseconds for a tetrahedron, whatever the kernel; a kernel adds its latency, and what
-does not run at once takes turns. The numbers are rounded from Chebyshev steps on an H100, 64 to 38,125 vertices
-(`benchmarks/kernels_by_batch.py`): in 218 batches the kernel with the least time here takes at most 1.02 times as long
-as the quickest. The times themselves are within a third of the measured ones in float32, within 1.8 times in float64.
-Only the order of the kernels matters, so that other GPUs need only be alike in proportion.
+`tets` counts the tetrahedra of one environment on its busiest multiprocessor. A multiprocessor takes `rate`
+microseconds per tetrahedron with every kernel; a kernel adds its latency. Environments that do not run concurrently
+take turns.
+
+The numbers are rounded from Chebyshev steps on an H100, for meshes of 64 to 38,125 vertices
+(`benchmarks/kernels_by_batch.py`). In 218 batches the chosen kernel takes at most 1.02 times as long as the fastest.
+The times agree with the measurement within a third in float32 and within a factor 1.8 in float64. Only the order of the
+kernels matters, so other GPUs need only have similar ratios.
 """
 
 from __future__ import annotations
@@ -17,41 +20,41 @@ from .. import _C
 from ..common.gpu import Properties
 from .cpu_plan import Plan
 
-__all__ = ["clusters_together", "iteration_microseconds", "kernel_microseconds"]
+__all__ = ["concurrent_environments", "iteration_microseconds", "kernel_microseconds"]
 
 _LATENCY = {"block": 1.0, "cluster": 1.0, "grid": 1.6, "stream": 8.0}
 _RATE = {torch.float32: 2.0e-3, torch.float64: 7.0e-3}
-_STREAM = 1.2  # times the rate: positions and forces pass through the GPU's memory
-# registers of a multiprocessor, and of a thread of a cluster (benchmarks/results/cuda-registers.csv)
+_STREAM = 1.2  # factor on the rate: positions and forces pass through global memory
+# registers per multiprocessor, and per thread of a cluster (benchmarks/results/cuda-registers.csv)
 _REGISTERS, _CLUSTER_REGISTERS = 65536, {torch.float32: 168, torch.float64: 256}
-# multiprocessors that blocks of a cluster are neighbours in, and the share of a GPU that has as many together
+# multiprocessors per group that can hold a cluster, and the share of a GPU in complete groups
 _NEIGHBOURS, _SHARE = 16, 7 / 8
 
 
-def clusters_together(plan: Plan, gpu: Properties) -> int:
-    """Environments that run at a time with a plan for "cluster"."""
+def concurrent_environments(plan: Plan, gpu: Properties) -> int:
+    """Number of environments that run concurrently with a plan for "cluster"."""
     real = torch.finfo(plan.dtype).bits // 8
     threads = _C.cluster_threads(real, plan.size("most_pairs"), plan.size("most_interior"))
     each = max(1, _REGISTERS // (threads * _CLUSTER_REGISTERS[plan.dtype]))
-    if plan.patches <= 2:  # neighbours are everywhere
+    if plan.patches <= 2:  # two blocks fit in any group
         return max(1, each * gpu.multiprocessors // plan.patches)
     groups = int(_SHARE * gpu.multiprocessors / _NEIGHBOURS)
     return max(1, groups * (each * _NEIGHBOURS // plan.patches))
 
 
 def kernel_microseconds(
-    kernel: str, patches: int, tets: int, batch: int, dtype: torch.dtype, gpu: Properties, together: int = 1
+    kernel: str, patches: int, tets: int, batch: int, dtype: torch.dtype, gpu: Properties, concurrent: int = 1
 ) -> float:
-    """Of an iteration of a whole batch.
+    """Estimated microseconds per iteration of a whole batch.
 
     Args:
         kernel: "block", "cluster", "grid" or "stream".
-        patches: blocks of one environment, for "cluster" and "grid".
-        tets: tetrahedra of one environment.
-        batch: environments.
+        patches: blocks per environment, for "cluster" and "grid".
+        tets: tetrahedra per environment.
+        batch: number of environments.
         dtype: precision.
-        gpu: what the device has.
-        together: environments that run at a time, for "cluster"; see `clusters_together`.
+        gpu: properties of the device.
+        concurrent: environments that run concurrently, for "cluster"; see `concurrent_environments`.
     """
     latency, rate = _LATENCY[kernel], _RATE[dtype]
     if kernel == "stream":
@@ -59,22 +62,22 @@ def kernel_microseconds(
     if kernel == "block":
         return latency + rate * tets * -(-batch // gpu.multiprocessors)
     if kernel == "grid":
-        together = max(1, gpu.multiprocessors // patches)
-    return -(-batch // together) * (latency + rate * tets / patches)
+        concurrent = max(1, gpu.multiprocessors // patches)
+    return -(-batch // concurrent) * (latency + rate * tets / patches)
 
 
 def iteration_microseconds(
     plan: Plan, tets: int, batch: int, gpu: Properties, dtype: torch.dtype | None = None
 ) -> float:
-    """Of an iteration of the whole batch, with the kernel that a plan is for.
+    """Estimated microseconds per iteration of the whole batch, with the kernel of a plan.
 
     Args:
         plan: of a GPU.
-        tets: tetrahedra of an environment; the plan counts those of neighbouring patches twice.
-        batch: environments of a step.
-        gpu: what the device has.
-        dtype: precision to take instead of the plan's.
+        tets: tetrahedra per environment; the plan counts those at patch borders more than once.
+        batch: number of environments.
+        gpu: properties of the device.
+        dtype: precision to use instead of that of the plan.
     """
     kernel = str(plan.kernel)
-    together = clusters_together(plan, gpu) if kernel == "cluster" else 1
-    return kernel_microseconds(kernel, plan.patches, tets, batch, dtype or plan.dtype, gpu, together)
+    concurrent = concurrent_environments(plan, gpu) if kernel == "cluster" else 1
+    return kernel_microseconds(kernel, plan.patches, tets, batch, dtype or plan.dtype, gpu, concurrent)

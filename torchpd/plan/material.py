@@ -1,4 +1,4 @@
-"""The arrays that training may change: how they start, and what they must be."""
+"""The material arrays of a simulator: initial values, shapes and checks."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from ..scene.scene import SceneValues
 __all__ = [
     "ARRAYS",
     "MATERIAL_ROWS",
-    "PARTS_OF_ROWS",
+    "SCENE_NAME_HINTS",
     "check_array",
     "check_batches",
     "check_environments",
-    "check_hard",
     "check_material",
+    "check_pin_hard",
     "dims_of",
     "environments_of_material",
+    "expand_rows",
     "fingerprint",
-    "in_order",
     "material_of",
+    "material_rows",
     "named_arrays",
-    "one_for_all_rows",
     "real_tensor",
 ]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
-ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # what `set_material` replaces
-# What users look for by the names of scenes.
-PARTS_OF_ROWS = {
-    "density": "masses are of vertices [kg], a density times their share of volume",
-    "youngs": "stiffness is Young's modulus of each tetrahedron [Pa]",
+ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # arrays that `set_material` replaces
+# hints for names of scene arguments given to `set_material`
+SCENE_NAME_HINTS = {
+    "density": "masses holds the mass of each vertex [kg], density times its share of the volume",
+    "youngs": "stiffness holds Young's modulus of each tetrahedron [Pa]",
 }
 
-_UNIT_SLACK = 1e-4  # of the length of a plane's normal: float32 rounding and a training step's
+_UNIT_SLACK = 1e-4  # tolerance on the length of a plane normal: float32 rounding, and that of a training step
 
 
 def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
-    """What `named_arrays` gives, of a scene, in the precision of the simulation, checked after rounding to it."""
+    """Material arrays of a scene by name, as `named_arrays`, in the simulation precision; checked after rounding."""
     at_rest = MATERIAL_ROWS["spheres"].width - values.spheres.shape[1]
     spheres = np.pad(values.spheres, ((0, 0), (0, at_rest)))
     material = {
@@ -54,7 +54,7 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
     soft = torch.isfinite(torch.from_numpy(values.pin_stiffness.copy()))
     if not bool(torch.isfinite(material["pin_stiffness"])[soft].all()):
         raise ValueError(
-            f"Pin.stiffness: a spring is too stiff for {dtype}; leave stiffness out to hold vertices exactly"
+            f"Pin.stiffness must be finite in {dtype}, got inf after rounding; leave stiffness out for hard pins"
         )
     for name, tensor in material.items():
         check_material("Simulator", name, tensor)
@@ -63,17 +63,17 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
 
 
 def dims_of(name: str) -> int:
-    """Dimensions of an array that all environments share."""
+    """Number of dimensions of an array without a batch."""
     return 1 if name == PIN_HARD else MATERIAL_ROWS[name].dims
 
 
 def named_arrays(sim: nn.Module) -> dict[str, Tensor]:
-    """The arrays as a simulator keeps them: those that training may change, and which pins are hard."""
+    """Material arrays of a simulator by name: the trainable ones and the mask of hard pins."""
     return {name: getattr(sim, name) for name in ARRAYS}
 
 
-def in_order(arrays: Mapping[str, Tensor]) -> list[Tensor]:
-    """The rows of the material as the ops take them, of what `named_arrays` gives."""
+def material_rows(arrays: Mapping[str, Tensor]) -> list[Tensor]:
+    """Rows of the material in the order of the ops, from the arrays by name."""
     held = {"pin_stiffness": hold_exactly(arrays["pin_stiffness"], arrays[PIN_HARD])}
     return [held.get(name, arrays[name]) for name in MATERIAL_ROWS]
 
@@ -88,7 +88,7 @@ def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:
 
 
 def check_material(owner: str, name: str, tensor: Tensor) -> None:
-    """Refuse values that no step can work with; shapes are the caller's to check."""
+    """Refuse values that a step cannot use; the caller checks shapes."""
     full = f"{owner}: {name}"
     if name == "pin_stiffness":
         _require(tensor >= 0, full, ">= 0, inf for pins that hold exactly,", tensor)
@@ -110,7 +110,7 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
 
 
 def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
-    """A tensor of real numbers that are there; on the CPU what is none yet."""
+    """Convert to a dense tensor of real numbers, on the CPU if it is not a tensor yet."""
     try:
         tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
     except (TypeError, ValueError, RuntimeError):
@@ -122,11 +122,11 @@ def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
     return tensor
 
 
-def one_for_all_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
-    """Expand one number for all rows, [] or [1], to [rows], and one for each environment, [B, 1], to [B, rows].
+def expand_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
+    """Expand one number, [] or [1], to [rows], and one per environment, [B, 1], to [B, rows].
 
-    The last dimension always counts rows: [n] is one number for each of n rows, never for each of n environments.
-    Only an array without rows, `damping`, has one number for each environment: [B], or [B, 1].
+    The last dimension always counts rows: [n] is one number for each of n rows, never for each of n environments. Only
+    an array without rows, `damping`, has one number for each environment: [B], or [B, 1].
     """
     if tensor.dim() > 2 or (name in MATERIAL_ROWS and MATERIAL_ROWS[name].width > 1):
         return tensor
@@ -137,12 +137,12 @@ def one_for_all_rows(name: str, tensor: Tensor, rows: int) -> Tensor:
 
 
 def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Tensor:
-    """What is to replace the array `own` of a simulator, in its precision and on its device."""
+    """Check a value for the material array `own`; returns it in the precision and on the device of `own`."""
     row, tensor = MATERIAL_ROWS[name], real_tensor(owner, name, value).detach()
     tensor = tensor.to(dtype=own.dtype, device=own.device)
     shape = tuple(own.shape[own.dim() - row.dims :])
     alone = tensor.dim() == 0
-    tensor = one_for_all_rows(name, tensor, shape[0] if shape else 1)
+    tensor = expand_rows(name, tensor, shape[0] if shape else 1)
     if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
         came = f"one number, {tensor.item():g}" if alone else list(tensor.shape)
         things = {"tet": "tetrahedra", "vertex": "vertices"}.get(row.rows, f"{row.rows}s")
@@ -152,17 +152,17 @@ def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Te
     return tensor.contiguous()
 
 
-def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
-    """What is to replace the mask of hard pins `own` of a simulator, on its device."""
+def check_pin_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
+    """Check a value for the mask of hard pins `own`; returns it on the device of `own`."""
     try:
         tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{owner}: {PIN_HARD} must be a bool or a bool tensor, got {value!r}") from None
     if tensor.dtype != torch.bool:
-        raise TypeError(f"{owner}: {PIN_HARD} must be bool, whether each pin is hard, got {tensor.dtype}")
+        raise TypeError(f"{owner}: {PIN_HARD} must be bool for each pin, got {tensor.dtype}")
     tensor = tensor.to(own.device)
     shape = own.shape[-1:]
-    tensor = one_for_all_rows(PIN_HARD, tensor, shape[0])
+    tensor = expand_rows(PIN_HARD, tensor, shape[0])
     if tensor.dim() > 2 or tensor.shape[-1:] != shape:
         raise ValueError(
             f"{owner}: {PIN_HARD} must be one bool, {list(shape)}, [B, 1] or [B, {shape[0]}], got "
@@ -172,7 +172,7 @@ def check_hard(owner: str, value: Tensor | float, own: Tensor) -> Tensor:
 
 
 def fingerprint(arrays: Iterable[Tensor]) -> str:
-    """Of shapes and bits: another one where any number differs. Brings the arrays to the CPU."""
+    """Hash of the shapes and bits of arrays. Copies them to the CPU."""
     found = hashlib.blake2b(digest_size=16)
     for array in arrays:
         found.update(repr(tuple(array.shape)).encode())
@@ -181,32 +181,32 @@ def fingerprint(arrays: Iterable[Tensor]) -> str:
 
 
 def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:
-    """Refuse arrays of different numbers of environments; those without a batch, or with one of 1, serve any number."""
+    """Refuse arrays with different numbers of environments; an array without a batch, or with 1, suits any number."""
     first: tuple[int, str] | None = None
     for name in ARRAYS:
         array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
         count = len(array) if array.dim() > dims_of(name) else 1
         if count == 0:
-            raise ValueError(f"{owner}: {name} must be of at least one environment, got {list(array.shape)}")
+            raise ValueError(f"{owner}: {name} must have at least one environment, got {list(array.shape)}")
         if first is not None and count not in (1, first[0]):
             raise ValueError(
-                f"{owner}: arrays must be of one number of environments, or of all, got those of {first[0]} "
-                f"environments in {first[1]}, of {count} in {name}{stays}; replace them in one call"
+                f"{owner}: arrays must have one number of environments or none, got {first[0]} environments in "
+                f"{first[1]} and {count} in {name}{stays}; replace them in one call"
             )
         if count != 1:
             first = count, name + stays
 
 
 def check_environments(name: str, batch: int, arrays: Mapping[str, Tensor]) -> None:
-    """Refuse material of other environments than those of a state, which `name` calls."""
+    """Refuse a state whose batch differs from that of the material; `name` names the state in the error."""
     for row, array in arrays.items():
         if array.dim() > dims_of(row) and len(array) not in (1, batch):
             raise ValueError(
-                f"{name} must have as many environments as the simulator's {row}, {len(array)}, got {batch}; "
-                "set_material takes another batch, or an array that all environments share"
+                f"{name} must have as many environments as the simulator's {row}, {len(array)}, got {batch}; replace "
+                f"{row} by set_material, for this batch or shared by all environments"
             )
 
 
 def environments_of_material(arrays: Mapping[str, Tensor]) -> int:
-    """How many environments arrays of the material, by name, have numbers for; 1 where all share them."""
+    """Number of environments of the material arrays by name; 1 where all share them."""
     return max(len(array) if array.dim() > dims_of(name) else 1 for name, array in arrays.items())

@@ -1,10 +1,9 @@
-"""Moving a simulator: every device needs a plan of its own."""
+"""Plan placement: compile, move and rebuild the plan when device, precision, solver or pins change."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -13,27 +12,34 @@ from torch import Tensor
 
 from .. import _C
 from ..common.checks import plain_tensor
-from ..common.gpu import free_memory, properties_of, refuse_full_memory, seen_devices, why_not
+from ..common.gpu import check_free_memory, free_memory, properties_of, unavailable_reason, visible_devices
 from ..ops.diagonal import pinned_vertices
 from ..scene.solvers import Multilevel
 from .compiled import CompiledScene
 from .cpu_plan import Plan, compile_plan, with_loose_components
-from .kernel_benchmark import quickest_plan, steps_of
+from .kernel_benchmark import benchmark_steps, fastest_plan
 from .kernel_choice import choose_plan
-from .material import in_order, material_of
-from .preconditioner import Reference, has_levels, precondition_plan, reference_of, reference_of_levels, without_levels
+from .material import material_of, material_rows
+from .preconditioner import (
+    ReferenceMaterial,
+    has_preconditioner,
+    precondition_plan,
+    reference_material,
+    stored_reference,
+    without_preconditioner,
+)
 
 __all__ = [
-    "check_wanted_device",
+    "check_target_device",
     "find_device",
     "is_recording",
-    "loosened_plan",
+    "is_suitable",
     "move_plan",
-    "plan_anew",
+    "plan_after_release",
+    "plan_for_device",
     "plan_for_solver",
-    "plan_on",
-    "plan_that_holds",
-    "serves",
+    "plan_without_released_pins",
+    "recompile_plan",
     "step_bytes",
 ]
 
@@ -42,11 +48,11 @@ Pieces = NDArray[np.bool_]
 
 def _reason(device: torch.device | None = None) -> str:
     capability = None if device is None else torch.cuda.get_device_capability(device)
-    return why_not(bool(_C.build_info()["cuda"]), torch.version.cuda, torch.cuda.device_count(), capability)
+    return unavailable_reason(bool(_C.build_info()["cuda"]), torch.version.cuda, torch.cuda.device_count(), capability)
 
 
 def find_device(name: str) -> torch.device:
-    """What --device names, if it is there."""
+    """Parse and check the `--device` argument."""
     kind = name.split(":")[0]
     if kind not in ("cpu", "cuda"):
         raise ValueError(f"--device must be cpu or cuda, got {name}")
@@ -54,18 +60,18 @@ def find_device(name: str) -> torch.device:
         raise ValueError("--device cuda: torch sees no CUDA device here; python -m torchpd doctor says more")
     device = torch.device(name)
     if kind == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ValueError(f"--device {name} is not there: {seen_devices()}")
+        raise ValueError(f"--device must be an existing GPU, got {name}: {visible_devices()}")
     return device
 
 
-def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor:
-    """What `fn`, which moves or converts, makes of an empty tensor; explains why a GPU cannot be had."""
+def check_target_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor:
+    """Apply `fn`, which moves or converts, to an empty tensor; explains why a GPU is not available."""
     try:
         wanted = fn(probe)
     except (AssertionError, RuntimeError) as error:
         reason = _reason()
         if not reason and "invalid device ordinal" in str(error):
-            raise RuntimeError(f"Simulator: there is no such GPU: {seen_devices()}") from error
+            raise RuntimeError(f"Simulator: device must be an existing GPU: {visible_devices()}") from error
         if not reason or not any(word in str(error) for word in ("CUDA", "NVIDIA")):
             raise
         raise RuntimeError(f"Simulator: no CUDA here: {reason}") from error
@@ -79,66 +85,72 @@ def check_wanted_device(fn: Callable[[Tensor], Tensor], probe: Tensor) -> Tensor
 
 
 def _same_plan(source: torch.device, target: torch.device) -> bool:
-    """Whether the plan of one device serves the other: nothing runs on "meta"."""
+    """Whether the plan of one device is valid on the other; nothing runs on "meta"."""
     if source.type != "cuda" or target.type != "cuda":
         return target.type in ("meta", source.type)
     return source == target or properties_of(source) == properties_of(target)
 
 
 def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
-    """The scene's plan for a device and the solver, on the CPU, without what the solver prepares."""
+    """Compile the plan of a scene for a device, on the CPU, without the preconditioner."""
     values = compiled.scene.values()
-    # "meta" does not know which pins are hard
+    # on "meta" the hard pins are unknown
     if loose is None and compiled.device.type != "meta":
         loose = values.pinned.loose(compiled.named["pin_stiffness"].isinf().cpu().numpy())
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=compiled.progress)
-    key, step = steps_of(compiled, dtype, device)
     return choose_plan(
         values, dtype, properties_of(device), compiled.kernel,
         levels=isinstance(compiled.solver, Multilevel), batch=compiled.batch, progress=compiled.progress,
-        quickest=partial(quickest_plan, key=key, step=step),
+        fastest=lambda plans: fastest_plan(plans, *benchmark_steps(compiled, dtype, device)),
     )  # fmt: skip
 
 
-def _wants_levels(compiled: CompiledScene) -> bool:
-    """Whether steps or gradients use a multilevel preconditioner."""
+def _uses_preconditioner(compiled: CompiledScene) -> bool:
+    """Whether the steps or the adjoint use a multilevel preconditioner."""
     return isinstance(compiled.solver, Multilevel) or compiled.adjoint == "multilevel"
 
 
 def _has_patches_for(compiled: CompiledScene, plan: Plan) -> bool:
-    """Whether the patches serve the solver: a GPU wants others for a multilevel solver, whatever gradients use."""
-    return plan.kernel is None or plan.for_levels == isinstance(compiled.solver, Multilevel)
+    """Whether the patches suit the solver: on a GPU a multilevel solver needs its own, the adjoint does not."""
+    return plan.kernel is None or plan.for_multilevel == isinstance(compiled.solver, Multilevel)
 
 
-def serves(compiled: CompiledScene) -> bool:
-    """Whether the plan has what solver and gradients use."""
-    return _has_patches_for(compiled, compiled.plan) and has_levels(compiled.plan.arrays) == _wants_levels(compiled)
+def is_suitable(compiled: CompiledScene) -> bool:
+    """Whether the plan suits the solver and the adjoint."""
+    return _has_patches_for(compiled, compiled.plan) and has_preconditioner(
+        compiled.plan.arrays
+    ) == _uses_preconditioner(compiled)
 
 
-def _with_levels(compiled: CompiledScene, plan: Plan, reference: Reference) -> Plan:
-    """The plan with a multilevel preconditioner; of a GPU's kernels only one reads it."""
+def _with_preconditioner(compiled: CompiledScene, plan: Plan, reference: ReferenceMaterial) -> Plan:
+    """Add a multilevel preconditioner to a plan. On a GPU only the stream kernel reads it."""
     if plan.kernel not in (None, "stream"):
         raise ValueError(
-            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={compiled.kernel!r}, which is '
-            f'"{plan.kernel}" for this scene; set kernel="stream", or leave adjoint at "solver"'
+            f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={compiled.kernel!r} '
+            f'("{plan.kernel}" for this scene); set kernel="stream", or leave adjoint at "solver"'
         )
     return precondition_plan(plan, compiled.scene.values(), *reference, progress=compiled.progress)
 
 
 def plan_for_solver(compiled: CompiledScene) -> Plan:
-    """The plan with what solver and gradients use, made of the material."""
-    plan = without_levels(compiled.plan)
+    """The plan for the current solver and adjoint; a preconditioner is built from the current material."""
+    plan = without_preconditioner(compiled.plan)
     if not _has_patches_for(compiled, plan):
         plan = _compile(compiled, compiled.dtype, compiled.device)
-    if _wants_levels(compiled):
-        plan = _with_levels(compiled, plan, reference_of(compiled.plan, compiled.material, compiled.time_step))
+    if _uses_preconditioner(compiled):
+        plan = _with_preconditioner(
+            compiled, plan, reference_material(compiled.plan, compiled.material, compiled.time_step)
+        )
     return move_plan(compiled, plan, compiled.device)
 
 
-def loosened_plan(compiled: CompiledScene, hard: Tensor) -> Plan:
-    """The plan where pieces that a mask [P] or [B, P] lets go move rigidly too; the one that is there if they do."""
+def plan_after_release(compiled: CompiledScene, hard: Tensor) -> Plan:
+    """The plan after pins are released by a mask [P] or [B, P]: their components may move rigidly too.
+
+    Returns the present plan if no component changes.
+    """
     before = compiled.plan.loose
     if before is None or bool(before.all()):
         return compiled.plan
@@ -147,17 +159,17 @@ def loosened_plan(compiled: CompiledScene, hard: Tensor) -> Plan:
         return compiled.plan
     if compiled.plan.kernel is None:
         return with_loose_components(compiled.plan, replace(compiled.scene.values(), loose=loose))
-    return move_plan(compiled, plan_anew(compiled, compiled.dtype, compiled.device, loose), compiled.device)
+    return move_plan(compiled, recompile_plan(compiled, compiled.dtype, compiled.device, loose), compiled.device)
 
 
-def plan_that_holds(compiled: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
-    """The plan whose preconditioner, if it has one, holds no pin but those that are hard in every environment [P].
+def plan_without_released_pins(compiled: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
+    """The plan with a preconditioner that holds only the pins that are hard in every environment [P].
 
-    It is made of what the one before was made of, but for the pins that are let go: held by it they would not move.
+    Its reference material stays, except at the released pins: held by the preconditioner, they would not move.
     """
-    if not has_levels(plan.arrays):
+    if not has_preconditioner(plan.arrays):
         return plan
-    stiffness, inertia = reference_of_levels(plan.arrays)
+    stiffness, inertia = stored_reference(plan.arrays)
     freed = pinned_vertices(plan.arrays)[~hard.to(plan.device)]
     freed = freed[inertia[freed].isinf()]
     if not len(freed):
@@ -170,26 +182,26 @@ def plan_that_holds(compiled: CompiledScene, plan: Plan, hard: Tensor) -> Plan:
 
 
 def move_plan(compiled: CompiledScene, plan: Plan, device: torch.device, material: int = 0) -> Plan:
-    """A plan on its device, where a GPU has room for it, for `material` bytes beside it and for a step."""
+    """Move a plan to a device. A GPU must have memory for it, `material` further bytes, and a step."""
     if plan.device == device:
         return plan
     if device.type == "cuda":
         needed = plan.bytes + material + step_bytes(compiled, plan, compiled.environments, device)
-        refuse_full_memory(needed, free_memory(device))
+        check_free_memory(needed, free_memory(device))
     return plan.to(device)
 
 
 def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.device) -> int:
-    """Memory of a step beside plan, material and states, as the op takes it.
+    """Memory of a step in bytes, beside plan, material and states, as the op allocates it.
 
     Args:
-        compiled: whose solver and material the step has.
-        plan: of a GPU, with what the solver prepares; it may still be on the CPU.
-        batch: environments.
+        compiled: the scene; its solver and material are used.
+        plan: of a GPU, with its preconditioner if any; it may still be on the CPU.
+        batch: number of environments.
         device: the GPU.
     """
     real = torch.finfo(plan.dtype).bits // 8
-    levels = plan.level_sizes.numpy() if has_levels(plan.arrays) else np.empty(0, dtype=np.int32)
+    levels = plan.level_sizes.numpy() if has_preconditioner(plan.arrays) else np.empty(0, dtype=np.int32)
     planes, spheres, stiffness = (compiled.named[name] for name in ("planes", "spheres", "stiffness"))
     own = stiffness.dim() == 2 and len(stiffness) == batch
     schedule: int = compiled.solver.settings()["schedule"]
@@ -200,28 +212,30 @@ def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.de
 
 
 def is_recording(device: torch.device) -> bool:
-    """Whether torch.compile or a CUDA graph is looking on, which can wait for no value."""
+    """Whether torch.compile or a CUDA graph is recording, so that no value may be read."""
     return torch.compiler.is_compiling() or (device.type == "cuda" and torch.cuda.is_current_stream_capturing())
 
 
-def plan_anew(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None) -> Plan:
-    """The plan for a precision and a device, on the CPU; `loose`: pieces that can move rigidly."""
+def recompile_plan(
+    compiled: CompiledScene, dtype: torch.dtype, device: torch.device, loose: Pieces | None = None
+) -> Plan:
+    """Compile the plan for a precision and a device, on the CPU; `loose`: components that may move rigidly."""
     plan = _compile(compiled, dtype, device, loose)
-    if not _wants_levels(compiled):
+    if not _uses_preconditioner(compiled):
         return plan
-    # what M was made of goes along, as into a file; coming from "meta" the values are lost
+    # The reference material stays, as in a saved file. On "meta" its values are lost.
     if compiled.device.type == "meta":
-        arrays = in_order(material_of(compiled.scene.values(), compiled.dtype))
+        arrays = material_rows(material_of(compiled.scene.values(), compiled.dtype))
         source = compile_plan(compiled.scene.values(), dtype=compiled.dtype, progress=False)
-        reference = reference_of(source, arrays, compiled.time_step)
+        reference = reference_material(source, arrays, compiled.time_step)
     else:
-        reference = reference_of_levels(compiled.plan.arrays)
-    return _with_levels(compiled, plan, reference)
+        reference = stored_reference(compiled.plan.arrays)
+    return _with_preconditioner(compiled, plan, reference)
 
 
-def plan_on(compiled: CompiledScene, dtype: torch.dtype, device: torch.device) -> Plan:
-    """The plan for a precision and a device: the one that is there, moved, where that will do."""
+def plan_for_device(compiled: CompiledScene, dtype: torch.dtype, device: torch.device) -> Plan:
+    """The plan for a precision and a device: the present one, moved, if it is valid there."""
     same = dtype == compiled.dtype and _same_plan(compiled.device, device)
-    plan = compiled.plan if same else plan_anew(compiled, dtype, device)
+    plan = compiled.plan if same else recompile_plan(compiled, dtype, device)
     numbers = sum(array.numel() for array in compiled.material) + 3 * compiled.vertices
     return move_plan(compiled, plan, device, numbers * (torch.finfo(dtype).bits // 8))

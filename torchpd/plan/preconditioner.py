@@ -1,4 +1,4 @@
-"""The multilevel preconditioner of a scene: made once, of the material then, as arrays that follow the plan's."""
+"""Construction of the multilevel preconditioner from a reference material; its arrays follow those of the plan."""
 
 from __future__ import annotations
 
@@ -16,54 +16,56 @@ from ..common.checks import tensor_of
 from ..common.tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
 from ..ops.diagonal import named_material, step_diagonal
 from ..scene.scene import SceneValues
-from .cpu_plan import Plan, compiling
+from .cpu_plan import Plan, compile_progress
 
 __all__ = [
-    "Reference",
-    "has_levels",
-    "has_strangers",
+    "ReferenceMaterial",
+    "has_outliers",
+    "has_preconditioner",
     "precondition_plan",
-    "reference_of",
-    "reference_of_levels",
-    "without_levels",
+    "reference_material",
+    "stored_reference",
+    "without_preconditioner",
 ]
 
-# Two dense products there take less time than the many short phases of a cycle: each of those waits for all blocks.
-# With many environments, of a block or two each, the cycle's fewer numbers take less, but for a mesh of one patch.
+# Up to this size two dense products are faster than the many short phases of a V-cycle, each of which synchronises all
+# blocks. With many environments of one or two blocks each, the V-cycle is faster, except on a mesh of one patch.
 MOST_DIRECT = 1024
 
-Reference = tuple[Tensor, Tensor]  # stiffness [E] Pa, and inertia a [V] N/m in the user's order, inf where held
+ReferenceMaterial = tuple[
+    Tensor, Tensor
+]  # Young's modulus [E] Pa, and inertia a [V] N/m in the user's order, inf where pinned
 
 
-def has_levels(plan: Sequence[Tensor]) -> bool:
-    """Whether the arrays of a plan, the CPU's or a GPU's, include those of a preconditioner."""
+def has_preconditioner(plan: Sequence[Tensor]) -> bool:
+    """Whether the arrays of a CPU or GPU plan include a multilevel preconditioner."""
     return len(plan) - len(MULTILEVEL_TABLE) in (len(PLAN_TABLE), len(DEVICE_PLAN_TABLE))
 
 
-def reference_of_levels(plan: Sequence[Tensor]) -> Reference:
-    """What the preconditioner of a plan was made of."""
+def stored_reference(plan: Sequence[Tensor]) -> ReferenceMaterial:
+    """Reference material that the preconditioner of a plan was built from."""
     levels = dict(zip((row.name for row in MULTILEVEL_TABLE), plan[-len(MULTILEVEL_TABLE) :], strict=True))
     _, vertex_order, *_ = plan
     stored = levels["reference_inertia"]
     return levels["reference_stiffness"], torch.zeros_like(stored).index_copy(0, vertex_order.long(), stored)
 
 
-def without_levels(plan: Plan) -> Plan:
-    """The plan alone."""
-    if not has_levels(plan.arrays):
+def without_preconditioner(plan: Plan) -> Plan:
+    """The plan without the arrays of its preconditioner."""
+    if not has_preconditioner(plan.arrays):
         return plan
     count = len(MULTILEVEL_TABLE)
     return replace(plan, arrays=plan.arrays[:-count], table=plan.table[:-count])
 
 
-def reference_of(plan: Plan, material: Sequence[Tensor], time_step: float) -> Reference:
-    """What a matrix for all environments is made of: the largest stiffness and inertia of any.
+def reference_material(plan: Plan, material: Sequence[Tensor], time_step: float) -> ReferenceMaterial:
+    """Reference material of a preconditioner for all environments: the largest stiffness and inertia of any.
 
-    A vertex counts as held where a hard pin holds it in every environment. An environment whose values are all s times
-    these loses nothing: M / s serves it exactly.
+    A vertex counts as pinned where a hard pin holds it in every environment. A uniform scale s costs nothing: M / s is
+    exact for an environment whose values are all s times these.
     """
     stiffness = named_material(material)["stiffness"].detach()
-    arrays = without_levels(plan).arrays
+    arrays = without_preconditioner(plan).arrays
     inertia, _ = step_diagonal(arrays, [array.detach() for array in material], time_step)
     stiffness = stiffness.amax(0) if stiffness.dim() == 2 else stiffness
     if inertia.dim() == 2:
@@ -72,16 +74,16 @@ def reference_of(plan: Plan, material: Sequence[Tensor], time_step: float) -> Re
     return stiffness, inertia
 
 
-def has_strangers(plan: Plan, material: Sequence[Tensor], time_step: float) -> bool:
-    """Whether springs hold any vertex so much harder than M knows that it is left to the diagonal."""
-    was, now = reference_of_levels(plan.arrays), reference_of(plan, material, time_step)
-    elements, inertias = ((new / old)[old.isfinite() & (old > 0.0)] for new, old in zip(now, was, strict=True))
+def has_outliers(plan: Plan, material: Sequence[Tensor], time_step: float) -> bool:
+    """Whether springs hold a vertex so much harder than the reference that only the diagonal applies there."""
+    former, current = stored_reference(plan.arrays), reference_material(plan, material, time_step)
+    elements, inertias = ((new / old)[old.isfinite() & (old > 0.0)] for new, old in zip(current, former, strict=True))
     inertias = inertias[inertias.isfinite()]
     if not len(inertias):
         return False
-    # as Misfit in csrc/solver/multilevel/material_mismatch.h: what has grown as a whole M serves
-    trusted = torch.maximum(elements.max(), inertias.min())
-    return bool(inertias.max() > _C.known_inertia * trusted)
+    # as in csrc/solver/multilevel/material_mismatch.h: a uniform growth of the material is no mismatch
+    scale = torch.maximum(elements.max(), inertias.min())
+    return bool(inertias.max() > _C.known_inertia * scale)
 
 
 def precondition_plan(
@@ -93,28 +95,28 @@ def precondition_plan(
     most_direct: int | None = None,
     progress: bool = False,
 ) -> Plan:
-    """The plan with a multilevel approximation of A^-1 for a material, see csrc/plan/multilevel/build.h.
+    """Add a multilevel approximation of A^-1 to a plan, see csrc/plan/multilevel/build.h.
 
     Args:
-        plan: of any device.
+        plan: on any device.
         values: of the scene that the plan was compiled from.
-        stiffness: [E] Pa.
-        inertia: a of each vertex [V] N/m in the user's order, inf where held.
-        most_direct: up to so many vertices M is A^-1, without levels. None: `MOST_DIRECT` on a GPU, but for many
-            environments of a mesh of several patches; 0 there and on a CPU.
+        stiffness: Young's modulus [E] Pa.
+        inertia: a of each vertex [V] N/m in the user's order, inf where pinned.
+        most_direct: largest number of vertices for which M is A^-1, without levels. None: 0 on the CPU; `MOST_DIRECT`
+            on a GPU, but 0 for many environments of a mesh of several patches.
         progress: show a bar when the mesh is large.
     """
-    plan = without_levels(plan)
+    plan = without_preconditioner(plan)
     order = plan.vertex_order.cpu().numpy()
     if most_direct is None:
         cycles = plan.kernel is None or (plan.many and plan.patches > 1)
         most_direct = 0 if cycles else MOST_DIRECT
 
     def rounded(values: Tensor) -> NDArray[np.float64]:
-        """In the plan's precision, which the arrays will have: it decides the bits."""
+        """Convert to the precision of the plan, which decides the bits."""
         return np.asarray(values.detach().to("cpu", plan.dtype).double().numpy())
 
-    with compiling(len(values.tets), progress) as advance:
+    with compile_progress(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_multilevel(
             values.rest_positions, values.tets, order, rounded(stiffness), rounded(inertia),
             most_direct, plan.kernel is not None, torch.get_num_threads(), advance,
@@ -123,7 +125,7 @@ def precondition_plan(
         arrays["coarse_columns"] = _by_columns(arrays["coarse_factor"])
     levels = (
         tensor_of(arrays[row.name]).to(
-            # the host reads sizes, and must not wait for a device
+            # `sizes` stay on the host, which must not wait for a device
             device=None if row.rows.endswith("size") else plan.device,
             dtype=plan.dtype if row.type == "real" else None,
         )
@@ -133,7 +135,7 @@ def precondition_plan(
 
 
 def _by_columns(packed: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A lower triangle that stands row by row, column by column."""
+    """Rearrange a lower triangle from row-major to column-major order."""
     size = int(np.sqrt(2 * len(packed)))
     column, row = np.triu_indices(size)
     return np.asarray(packed[row * (row + 1) // 2 + column])

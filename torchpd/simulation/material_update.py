@@ -1,4 +1,4 @@
-"""How the material of a simulator is replaced: checked first, then all arrays or none."""
+"""Replacement of the material of a simulator: all arrays are checked first, then all or none are written."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from ..plan.cpu_plan import Plan
 from ..plan.material import (
     ARRAYS,
     MATERIAL_ROWS,
-    PARTS_OF_ROWS,
+    SCENE_NAME_HINTS,
     check_array,
     check_batches,
-    check_hard,
+    check_pin_hard,
     dims_of,
-    in_order,
+    expand_rows,
+    material_rows,
     named_arrays,
-    one_for_all_rows,
     real_tensor,
 )
-from ..plan.placement import loosened_plan, plan_for_solver
-from ..plan.preconditioner import has_levels, has_strangers
+from ..plan.placement import plan_after_release, plan_for_solver
+from ..plan.preconditioner import has_outliers, has_preconditioner
 from ..scene.pins import PIN_HARD, split_springs
-from .parametrization import invert, make, parametrization
+from .parametrization import apply_parametrization, invert_parametrization, parametrization
 
 __all__ = [
-    "Change",
+    "MaterialChange",
     "check_change",
     "check_keys",
     "check_originals",
@@ -44,81 +44,81 @@ __all__ = [
     "write_change",
 ]
 
-# what decides how many iterations a step takes
-_OF_THE_RATE = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
-# of each name the arrays that have it, and where
+# arrays that the convergence rate of a step depends on
+_RATE_ARRAYS = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
+# columns by name: the arrays that have one, and its place there
 COLUMNS = {
     "friction": {"planes": PLANES["friction"], "spheres": SPHERES["friction"]},
     "height": {"planes": PLANES["height"]},
     "radius": {"spheres": SPHERES["radius"]},
 }
-_THINGS = {"planes": "grounds", "spheres": "spheres"}
+_OWNERS_OF_ROWS = {"planes": "grounds", "spheres": "spheres"}
 
 
-class Change(NamedTuple):
-    """Arrays that are to be replaced, checked, and the plan that serves them."""
+class MaterialChange(NamedTuple):
+    """A checked change of the material, and the plan that suits it."""
 
-    arrays: dict[str, Tensor]  # by name, as they will be
-    originals: dict[str, Tensor]  # of those that a parametrization makes
-    replaced: dict[str, Tensor]  # new parameters, and a new buffer, where nothing can be written over
+    arrays: dict[str, Tensor]  # new values by name
+    originals: dict[str, Tensor]  # originals of parametrized arrays
+    replaced: dict[str, Tensor]  # new parameters, or a new buffer, where the present ones cannot be written in place
     plan: Plan
-    learned: list[str]  # those of another batch whose former parameter was learned
+    new_trainable: list[str]  # trainable parameters that are new because the batch changed
 
     @property
-    def alters_pins(self) -> bool:
-        """Whether pins are held otherwise."""
+    def changes_pins(self) -> bool:
+        """Whether the change touches the pins."""
         return "pin_stiffness" in self.arrays or PIN_HARD in self.arrays
 
     @property
-    def alters_rate(self) -> bool:
-        """Whether a step may take another number of iterations."""
-        return any(name in self.arrays for name in _OF_THE_RATE)
+    def changes_rate(self) -> bool:
+        """Whether the change may alter the convergence rate of a step."""
+        return any(name in self.arrays for name in _RATE_ARRAYS)
 
 
 def check_change(
-    sim: nn.Module, compiled: CompiledScene, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False
-) -> Change:
-    """What `set_material` and loading are to write, for whom errors name; `anew`: nothing is written over."""
+    sim: nn.Module, compiled: CompiledScene, owner: str, arrays: Mapping[str, Tensor | float], *, assign: bool = False
+) -> MaterialChange:
+    """Check the arrays of `set_material` or of a state_dict; `assign`: make new parameters, write none in place."""
     check_has_values(owner, compiled.device)
     for name in arrays:
         if name not in ARRAYS and name not in COLUMNS:
             names = ", ".join([*ARRAYS, *COLUMNS])
-            part_of = f"; {PARTS_OF_ROWS[name]}" if name in PARTS_OF_ROWS else ""
+            part_of = f"; {SCENE_NAME_HINTS[name]}" if name in SCENE_NAME_HINTS else ""
             raise TypeError(f"{owner}: no array {name!r}; there are {names}{part_of}")
     own = named_arrays(sim)
-    arrays = _whole_arrays(own, owner, arrays)
+    arrays = _expand_columns(own, owner, arrays)
     replaces_hard, hard = PIN_HARD in arrays, arrays.pop(PIN_HARD, False)
     checked = {name: check_array(owner, name, value, own[name]) for name, value in arrays.items()}
     for name, value in arrays.items():
         if torch.is_grad_enabled() and isinstance(value, Tensor) and value.requires_grad:
             warn_user(
-                f"{owner} copies the numbers of {name}, so no gradient gets to what they were made of: give "
-                f'it to calls by torch.func.functional_call(sim, {{"{name}": ...}}, (state,)), or detach() it'
+                f"{owner} copies the values of {name}, so gradients do not reach the tensor given. Detach it, or "
+                f'pass it per call: torch.func.functional_call(sim, {{"{name}": ...}}, (state,))'
             )
     if replaces_hard:
-        checked[PIN_HARD] = check_hard(owner, hard, own[PIN_HARD])
+        checked[PIN_HARD] = check_pin_hard(owner, hard, own[PIN_HARD])
     hard_of_springs = {PIN_HARD: checked["pin_stiffness"]} if "pin_stiffness" in checked else {}
     check_batches(owner, hard_of_springs | checked, own)
     if "pin_stiffness" in checked:
-        checked |= _pins_apart(own[PIN_HARD], owner, checked["pin_stiffness"], checked.get(PIN_HARD))
+        checked |= _split_pins(own[PIN_HARD], owner, checked["pin_stiffness"], checked.get(PIN_HARD))
     with persistent_tensors():
         originals = {}
         for name in [name for name in checked if is_parametrized(sim, name)]:
-            originals[name], checked[name] = invert(owner, sim, name, checked[name])
+            originals[name], checked[name] = invert_parametrization(owner, sim, name, checked[name])
         reshaped = {name for name, tensor in checked.items() if tensor.shape != own[name].shape}
         replaced = {
             name: tensor.clone()
             if name == PIN_HARD
             else nn.Parameter(tensor.clone(), requires_grad=own[name].requires_grad)
             for name, tensor in checked.items()
-            if name not in originals and (anew or name in reshaped)
+            if name not in originals and (assign or name in reshaped)
         }
-        learned = [name for name, tensor in replaced.items() if name in reshaped and tensor.requires_grad]
-        return Change(checked, originals, replaced, _plan_with(compiled, own, checked), learned)
+        new_trainable = [name for name, tensor in replaced.items() if name in reshaped and tensor.requires_grad]
+        return MaterialChange(checked, originals, replaced, _updated_plan(compiled, own, checked), new_trainable)
 
 
-def write_change(sim: nn.Module, change: Change) -> None:
-    """Replace the arrays of a simulator; its plan is the caller's to replace."""
+def write_change(sim: nn.Module, change: MaterialChange) -> None:
+    """Write the arrays of a change; the caller replaces the plan."""
     with persistent_tensors():
         for name, tensor in change.arrays.items():
             if name in change.originals:
@@ -129,27 +129,30 @@ def write_change(sim: nn.Module, change: Change) -> None:
                 getattr(sim, name).copy_(tensor)
 
 
-def warn_of_new_parameters(change: Change) -> None:
-    """Say which parameters an optimiser does not know."""
-    if change.learned:
+def warn_of_new_parameters(change: MaterialChange) -> None:
+    """Warn of new parameters that an existing optimiser does not hold."""
+    if change.new_trainable:
         warn_user(
-            f"the simulator has a new parameter for {' and '.join(change.learned)}, of another batch, which an "
-            "optimiser of the one before does not know: make the optimiser anew, or set the batch first"
+            f"the simulator has a new parameter for {' and '.join(change.new_trainable)}, because the batch changed. "
+            "An existing optimiser still holds the former one: create the optimiser again, or set the batch first"
         )
 
 
-def _pins_apart(was: Tensor, owner: str, springs: Tensor, hard: Tensor | None) -> dict[str, Tensor]:
-    """Springs as they are stored, and which pins are hard: given as inf, or those that `hard` says; `was`: now."""
+def _split_pins(was: Tensor, owner: str, springs: Tensor, hard: Tensor | None) -> dict[str, Tensor]:
+    """Split springs into stored values and the mask of hard pins; `was` is the present mask.
+
+    A pin is hard where its spring is inf, or where `hard` says so.
+    """
     stored, infinite = split_springs(springs)
     if hard is not None:
-        _refuse_pins(f"{owner}: pin_stiffness is inf, which holds exactly, where {PIN_HARD} is False", infinite & ~hard)
+        _refuse_pins(f"{owner}: pin_stiffness must be finite where {PIN_HARD} is False, got inf", infinite & ~hard)
         return {"pin_stiffness": stored, PIN_HARD: hard}
     if was.dim() == 2 and was.shape != springs.shape:
         was = was.any(0)
-    # what sim.pin_stiffness has there: who scales that must not let go unawares
+    # sim.pin_stiffness holds 0 at hard pins: scaling it must not release them silently
     _refuse_pins(
-        f"{owner}: pin_stiffness is 0 for pins that are hard, and does not say whether these are let go: give inf to "
-        f"hold on, {PIN_HARD}=False to let go, or {PIN_HARD} of every pin",
+        f"{owner}: pin_stiffness is 0 at hard pins, which may mean to keep or to release them. Give inf to keep them "
+        f"hard, {PIN_HARD}=False to release them, or {PIN_HARD} of every pin",
         was & (springs == 0.0),
     )
     return {"pin_stiffness": stored, PIN_HARD: infinite}
@@ -161,39 +164,39 @@ def _refuse_pins(fault: str, bad: Tensor) -> None:
         raise ValueError(f"{fault}; at {places[0].tolist()} ({len(places)} in all)")
 
 
-def _plan_with(compiled: CompiledScene, own: dict[str, Tensor], arrays: dict[str, Tensor]) -> Plan:
-    """The plan that serves the material with some arrays replaced."""
+def _updated_plan(compiled: CompiledScene, own: dict[str, Tensor], arrays: dict[str, Tensor]) -> Plan:
+    """The plan that suits the material after some arrays are replaced."""
     if "pin_stiffness" not in arrays and PIN_HARD not in arrays:
         return compiled.plan
-    now = in_order(own | arrays)
-    plan = loosened_plan(compiled, arrays.get(PIN_HARD, own[PIN_HARD]))
-    if not has_levels(plan.arrays):
+    now = material_rows(own | arrays)
+    plan = plan_after_release(compiled, arrays.get(PIN_HARD, own[PIN_HARD]))
+    if not has_preconditioner(plan.arrays):
         return plan
-    # what is held belongs to the structure of a preconditioner
-    held = _held_everywhere(compiled.material), _held_everywhere(now)
-    if torch.equal(*held) and not has_strangers(plan, now, compiled.time_step):
+    # pinned vertices are part of the structure of a preconditioner
+    held = _hard_everywhere(compiled.material), _hard_everywhere(now)
+    if torch.equal(*held) and not has_outliers(plan, now, compiled.time_step):
         return plan
     return plan_for_solver(replace(compiled, plan=plan, material=now))
 
 
-def _held_everywhere(material: list[Tensor]) -> Tensor:
-    """Whether each pin holds exactly in all environments [P]."""
+def _hard_everywhere(material: list[Tensor]) -> Tensor:
+    """Whether each pin is hard in all environments [P]."""
     hard = named_material(material)["pin_stiffness"].isinf()
     return hard.all(0) if hard.dim() == 2 else hard
 
 
-# ---- columns that have names in scenes: friction, height of grounds, radius of spheres
+# ---- columns by name: friction, height of grounds, radius of spheres
 
 
-def _whole_arrays(
+def _expand_columns(
     own: Mapping[str, Tensor], owner: str, arrays: Mapping[str, Tensor | float]
 ) -> dict[str, Tensor | float]:
-    """The arrays with the named columns written into those of the simulator; values are the caller's to check."""
+    """Write named columns into whole arrays; the caller checks values."""
     whole = {name: value for name, value in arrays.items() if name not in COLUMNS}
     for name in [name for name in arrays if name in COLUMNS]:
         if given := [array for array in COLUMNS[name] if array in arrays]:
             column = COLUMNS[name][given[0]]
-            raise TypeError(f"{owner}: give {name} or {given[0]}, whose column {column} it is, got both")
+            raise TypeError(f"{owner}: give {name} or {given[0]} (it is column {column} there), got both")
         rows = {array: own[array].shape[-2] for array in COLUMNS[name]}
         value = _column(own["planes"], owner, name, arrays[name], rows)
         for array, part in zip(rows, value.split(list(rows.values()), dim=-1), strict=True):
@@ -205,10 +208,10 @@ def _whole_arrays(
 
 
 def _column(like: Tensor, owner: str, name: str, value: Tensor | float, rows: Mapping[str, int]) -> Tensor:
-    """[rows] or [B, rows], in the precision and on the device of `like`."""
-    things, count = " and ".join(_THINGS[array] for array in rows), sum(rows.values())
+    """Expand a column value to [rows] or [B, rows], in the precision and on the device of `like`."""
+    things, count = " and ".join(_OWNERS_OF_ROWS[array] for array in rows), sum(rows.values())
     if count == 0:
-        raise ValueError(f"{owner}: {name} is of {things}, and the scene has none")
+        raise ValueError(f"{owner}: {name} belongs to {things}, and the scene has none")
     tensor = real_tensor(owner, name, value)
     if tensor.dim() > 2 or tensor.numel() == 0 or (tensor.dim() > 0 and tensor.shape[-1] not in (1, count)):
         raise ValueError(
@@ -219,11 +222,12 @@ def _column(like: Tensor, owner: str, name: str, value: Tensor | float, rows: Ma
 
 
 def _with_column(owner: str, name: str, array: str, own: Tensor, value: Tensor) -> Tensor:
-    """The array [rows, width], or with a batch, with other numbers in one column."""
+    """Copy of an array [rows, width], or with a batch, with one column replaced."""
     batches = [len(t) for t, dims in ((own, MATERIAL_ROWS[array].dims), (value, 1)) if t.dim() > dims]
     if len(batches) == 2 and batches[0] != batches[1] and 1 not in batches:
         raise ValueError(
-            f"{owner}: {name} is of {batches[1]} environments, but {array} are of {batches[0]}; give {array} instead"
+            f"{owner}: {name} must have the {batches[0]} environments of {array}, got {batches[1]}; give {array} "
+            "instead"
         )
     if batches:
         own, value = own.expand(max(batches), *own.shape[-2:]), value.expand(max(batches), value.shape[-1])
@@ -234,8 +238,8 @@ def _with_column(owner: str, name: str, array: str, own: Tensor, value: Tensor) 
 # ---- loading
 
 
-def check_kinds(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
-    """Refuse what a simulator cannot keep as it is: tensors of another precision or device."""
+def check_dtype_device(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
+    """Refuse tensors of another precision or device, which a simulator cannot adopt without a conversion."""
     for name, array in arrays.items():
         own = getattr(sim, name)
         if isinstance(array, Tensor) and (array.dtype, array.device) != (own.dtype, own.device):
@@ -253,30 +257,30 @@ def load_material(
     replace_material: Callable[..., None],
     load: Callable[..., None],
 ) -> None:
-    """Check values, and replace by arrays of every environment where they were shared; then `load` as torch does.
+    """Check the material in a state_dict, write it, then call `load`, torch's own loader.
 
-    Takes the arguments of `Module._load_from_state_dict`.
+    Takes the arguments of `Module._load_from_state_dict`. Arrays that environments shared may get a batch.
     """
     local_metadata, *_, errors = rest
     assign = bool(local_metadata.get("assign_to_params_buffers", False))
     owner = f"{type(sim).__name__}.load_state_dict"
     arrays = {n: state_dict[prefix + n] for n in ARRAYS if prefix + n in state_dict}
-    # older ones say by inf which pins are hard
+    # former files mark hard pins by inf in pin_stiffness
     older, original = PIN_HARD not in arrays, f"{prefix}parametrizations.pin_stiffness.original"
     try:
         with torch.no_grad():
             if older and original in state_dict and is_parametrized(sim, "pin_stiffness"):
-                made = make(sim, "pin_stiffness", state_dict[original])
+                made = apply_parametrization(sim, "pin_stiffness", state_dict[original])
                 arrays |= {"pin_stiffness": made} if bool(made.isinf().any()) else {PIN_HARD: made.isinf()}
-            check_saved(sim, owner, arrays)
+            check_saved_shapes(sim, owner, arrays)
             if older and PIN_HARD not in arrays and bool(arrays.get("pin_stiffness", torch.zeros(())).isinf().any()):
-                # none of the present version has inf, so 0 there is a pin that was let go
+                # present files hold no inf: 0 there is a pin that was released
                 arrays[PIN_HARD] = arrays["pin_stiffness"].isinf()
             if assign:
-                check_kinds(sim, owner, arrays)
+                check_dtype_device(sim, owner, arrays)
             elif PIN_HARD in arrays:
-                arrays[PIN_HARD] = arrays[PIN_HARD].bool()  # as torch converts the others
-            replace_material(owner, arrays, anew=assign)
+                arrays[PIN_HARD] = arrays[PIN_HARD].bool()  # torch converts the other arrays likewise
+            replace_material(owner, arrays, assign=assign)
     except (TypeError, ValueError) as error:
         if not prefix:
             raise
@@ -291,8 +295,8 @@ def load_material(
     load(state_dict, prefix, *rest)
 
 
-def check_saved(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
-    """Refuse what `set_material` would stretch, and torch refuses after arrays before it are written."""
+def check_saved_shapes(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
+    """Refuse shapes that `set_material` would expand: torch would refuse them after writing other arrays."""
     for name, array in arrays.items():
         if not isinstance(array, Tensor):
             raise TypeError(f"{owner}: {name} must be a tensor, got {type(array).__name__}")
@@ -300,7 +304,7 @@ def check_saved(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
         if array.dim() < dims:
             raise ValueError(f"{owner}: {name} must have {dims} or {dims + 1} dimensions, got {list(array.shape)}")
         own = getattr(sim, name).shape
-        if one_for_all_rows(name, array, own[-1] if dims else 1).shape != array.shape:
+        if expand_rows(name, array, own[-1] if dims else 1).shape != array.shape:
             wanted = list(own[len(own) - dims :])
             raise ValueError(
                 f"{owner}: {name} must be {wanted}, or with a batch in front, got {list(array.shape)}; set_material "
@@ -309,7 +313,7 @@ def check_saved(sim: nn.Module, owner: str, arrays: Mapping[str, Any]) -> None:
 
 
 def check_originals(sim: nn.Module, state_dict: Mapping[str, Any]) -> None:
-    """Refuse what does not fit a parametrization, which torch finds out after arrays before it are written."""
+    """Refuse originals of a wrong shape: torch would find them after writing other arrays."""
     own = sim.state_dict()
     for name, array in state_dict.items():
         if not name.startswith("parametrizations.") or name not in own:
@@ -317,25 +321,25 @@ def check_originals(sim: nn.Module, state_dict: Mapping[str, Any]) -> None:
         if not isinstance(array, Tensor) or array.shape != own[name].shape:
             came = list(array.shape) if isinstance(array, Tensor) else type(array).__name__
             raise ValueError(
-                f"{type(sim).__name__}.load_state_dict: {name} must be a tensor {list(own[name].shape)} like that of "
-                f"the simulator, got {came}"
+                f"{type(sim).__name__}.load_state_dict: {name} must be a tensor {list(own[name].shape)}, as in the "
+                f"simulator, got {came}"
             )
 
 
 def check_keys(sim: nn.Module, state_dict: Mapping[str, Any], *, strict: bool) -> None:
-    """Refuse what is no state_dict and, where `strict`, one with other names, before anything is loaded."""
+    """Refuse an object that is no state_dict or, if `strict`, one with other keys, before anything is loaded."""
     if not isinstance(state_dict, Mapping):
         raise TypeError(
-            f"{type(sim).__name__}.load_state_dict: state_dict must be what state_dict() gave, got "
+            f"{type(sim).__name__}.load_state_dict: state_dict must be a mapping from state_dict(), got "
             f"{type(state_dict).__name__}"
         )
-    # a hook may give keys other names
+    # a hook may rename keys
     if strict and not sim._load_state_dict_pre_hooks:
         wanted = sim.state_dict()
         faults = [
             f"{fault} key(s) in state_dict: {', '.join(map(repr, keys))}"
             for fault, keys in (
-                # which pins are hard older ones say by inf
+                # former files have no mask of hard pins
                 ("Missing", [key for key in wanted if key not in (*state_dict, PIN_HARD)]),
                 ("Unexpected", [key for key in state_dict if key not in wanted]),
             )

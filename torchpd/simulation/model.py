@@ -17,7 +17,7 @@ from ..plan.cpu_plan import Plan, compile_plan
 from ..plan.kernel_choice import check_kernel
 from ..plan.material import MATERIAL_ROWS, material_of
 from ..plan.mutation_guard import MutationGuard, check_rest
-from ..plan.placement import check_wanted_device, is_recording
+from ..plan.placement import check_target_device, is_recording
 from ..scene.pins import PIN_HARD, hold_exactly
 from ..scene.scene import Scene
 from ..scene.solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, SolverName, check_solver
@@ -105,7 +105,7 @@ class Model(nn.Module):
         if not isinstance(scene, Scene):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         if device is not None:  # before a large scene is compiled
-            check_wanted_device(lambda probe: probe.to(device), torch.empty(0, dtype=dtype))
+            check_target_device(lambda probe: probe.to(device), torch.empty(0, dtype=dtype))
         self.scene = scene
         self._time_step = check_time_step(time_step, dtype)
         self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
@@ -350,16 +350,16 @@ class Model(nn.Module):
         """
         self._replace_material("set_material", arrays)
 
-    def _replace_material(self, owner: str, arrays: Mapping[str, Tensor | float], *, anew: bool = False) -> None:
-        change = check_change(self, self.compiled, owner, arrays, anew=anew)
+    def _replace_material(self, owner: str, arrays: Mapping[str, Tensor | float], *, assign: bool = False) -> None:
+        change = check_change(self, self.compiled, owner, arrays, assign=assign)
         result = self.tuning_result
         if result is not None and any(not torch.equal(new, getattr(self, n)) for n, new in change.arrays.items()):
             result.invalidate(True)
         write_change(self, change)
-        if change.alters_pins:
+        if change.changes_pins:
             self.plan = change.plan
             self._refresh_pin_mask()
-        if change.alters_rate:
+        if change.changes_rate:
             self.check_iterations(owner)
         warn_of_new_parameters(change)
 
@@ -426,7 +426,7 @@ class Model(nn.Module):
         return [replaced.get(row, array).contiguous() for row, array in zip(MATERIAL_ROWS, material, strict=True)]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        wanted = check_wanted_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
+        wanted = check_target_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator: dtype must be torch.float32 or torch.float64, got {wanted.dtype}")
         check_time_step(self.time_step, wanted.dtype)

@@ -11,8 +11,8 @@ from ..common.checks import has_values, plain_tensor
 from ..plan.compiled import CompiledScene, persistent_tensors
 from ..plan.cpu_plan import Plan
 from ..plan.mutation_guard import MutationGuard
-from ..plan.placement import is_recording, loosened_plan, plan_that_holds
-from ..plan.preconditioner import has_levels
+from ..plan.placement import is_recording, plan_after_release, plan_without_released_pins
+from ..plan.preconditioner import has_preconditioner
 from ..scene.pins import hold_exactly
 
 __all__ = ["PinMask", "held_springs", "read_pin_mask", "serves_any_mask"]
@@ -43,7 +43,7 @@ def held_springs(mask: PinMask, springs: Tensor, hard: Tensor) -> Tensor:
 
 def serves_any_mask(plan: Plan) -> bool:
     """Whether nothing in a plan depends on which pins are hard."""
-    return (plan.loose is None or bool(plan.loose.all())) and not has_levels(plan.arrays)
+    return (plan.loose is None or bool(plan.loose.all())) and not has_preconditioner(plan.arrays)
 
 
 def read_pin_mask(compiled: CompiledScene, hard: Tensor, *, wait: bool = False) -> tuple[MutationGuard, Plan]:
@@ -58,7 +58,7 @@ def read_pin_mask(compiled: CompiledScene, hard: Tensor, *, wait: bool = False) 
     rows = plain.cpu().reshape(-1, plain.shape[-1])
     mask = PinMask(some=bool(rows.any()))
     with persistent_tensors():
-        plan = plan_that_holds(compiled, loosened_plan(compiled, rows), rows.all(0))
+        plan = plan_without_released_pins(compiled, plan_after_release(compiled, rows), rows.all(0))
         # streams wait for a change of material, but not for a tensor that another stream made in a step
         if plain is hard and type(springs) is nn.Parameter and mask.some and (wait or not hard.is_cuda):
             version = None if bool(rows.all()) else springs._version

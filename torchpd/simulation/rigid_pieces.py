@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..common.checks import check_has_values, check_scalar, check_whole
 from ..ops.diagonal import step_diagonal
-from ..plan.preconditioner import reference_of
+from ..plan.preconditioner import reference_material
 from .state import Info, State
 from .stepper import Stepper
 from .stiff_pieces import find_pieces
@@ -80,7 +80,7 @@ class RigidPieces:
         """
         sim = self.sim
         check_has_values("RigidPieces", sim.device)
-        reference = tuple(array.clone() for array in reference_of(sim.plan, sim.material(), sim.time_step))
+        reference = tuple(array.clone() for array in reference_material(sim.plan, sim.material(), sim.time_step))
         stiffness, inertia = (array.cpu().double().numpy() for array in reference)
         found = find_pieces(sim.scene.values(), stiffness, inertia, self.stiffer_than, sim.dtype, sim.device)
         functions, fits = (
@@ -158,7 +158,7 @@ class RigidPieces:
         seen = _look(sim)
         if all(one[0] is other[0] and one[1:] == other[1:] for one, other in zip(seen, self._seen, strict=True)):
             return
-        now = reference_of(sim.plan, sim.material(), sim.time_step)
+        now = reference_material(sim.plan, sim.material(), sim.time_step)
         faults = [
             f"time_step was {self._time_step:g} s and is {sim.time_step:g} s" * (sim.time_step != self._time_step),
             "stiffness has changed" * (not torch.equal(now[0], stiffness)),

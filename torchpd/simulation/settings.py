@@ -17,7 +17,7 @@ from ..common.checks import check_has_values
 from ..estimate.solver_choice import Choice, choose_solver, warn_of_few_iterations
 from ..plan.compiled import CompiledScene
 from ..plan.kernel_choice import check_kernel
-from ..plan.placement import move_plan, plan_anew, plan_for_solver, plan_on, serves
+from ..plan.placement import is_suitable, move_plan, plan_for_device, plan_for_solver, recompile_plan
 from ..scene.solvers import Chebyshev, Solver, check_solver
 from .state_checks import check_adjoint, check_batch
 
@@ -81,7 +81,7 @@ def _with_solver(now: Configuration, solver: Any) -> Configuration:
 
 def _with_adjoint(now: Configuration, adjoint: str) -> Configuration:
     now = replace(now, adjoint=check_adjoint(adjoint))
-    if serves(now):
+    if is_suitable(now):
         return now
     check_has_values("adjoint", now.device)
     return replace(now, plan=plan_for_solver(now))
@@ -106,7 +106,7 @@ def moved(now: Configuration, dtype: torch.dtype, device: torch.device) -> Confi
     """The configuration with the plan of another precision or device, where the material will be."""
     if device.type == "cuda":
         check_solver(now.solver, device)
-    return replace(now, plan=plan_on(now, dtype, device))
+    return replace(now, plan=plan_for_device(now, dtype, device))
 
 
 def check_iterations(now: Configuration, changed: str | None) -> Configuration:
@@ -122,8 +122,8 @@ def check_iterations(now: Configuration, changed: str | None) -> Configuration:
 def _planned_anew(now: Configuration) -> Configuration:
     """Make a GPU's plan and the choice of "auto" again, after a change of their inputs."""
     # "auto" starts from a plan for Chebyshev
-    if now.plan.kernel is not None and not (now.choice is not None and now.plan.for_levels):
-        now = replace(now, plan=move_plan(now, plan_anew(now, now.dtype, now.device), now.device))
+    if now.plan.kernel is not None and not (now.choice is not None and now.plan.for_multilevel):
+        now = replace(now, plan=move_plan(now, recompile_plan(now, now.dtype, now.device), now.device))
     return choose_again(now)
 
 
@@ -131,12 +131,12 @@ def _solved_by(now: Configuration, solver: Solver) -> Configuration:
     # the same number of iterations means another error for another solver
     checked = EVERY_STEP if now.named_iterations else NO_STEP
     now = replace(now, solver=solver, choice=None, checked_time_steps=checked)
-    return now if serves(now) else replace(now, plan=plan_for_solver(now))
+    return now if is_suitable(now) else replace(now, plan=plan_for_solver(now))
 
 
 def choose(now: Configuration, iterations: int | None) -> Configuration:
     """Choose as "auto" does, see `choose_solver`."""
-    if now.plan.for_levels:
+    if now.plan.for_multilevel:
         now = _solved_by(now, Chebyshev())  # the costs are compared with the kernel of Chebyshev
     solver, choice = choose_solver(now, iterations)
     now = replace(_solved_by(now, solver), choice=choice, iterations=choice.iterations)

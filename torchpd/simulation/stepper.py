@@ -10,7 +10,7 @@ from torch import Tensor
 from ..common.checks import check_like, check_whole
 from ..common.synonyms import check_arguments
 from ..ops.adjoint import step_gradient
-from ..ops.registration import INFO_WIDTH, refuse_tangents
+from ..ops.registration import INFO_WIDTH, refuse_forward_mode
 from ..plan.material import MATERIAL_ROWS, environments_of_material, named_arrays
 from ..scene.targets import Targets
 from .readable import Readable
@@ -75,7 +75,7 @@ class Stepper(Readable):
         forces = self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])
         given, inertial = _first_iterate(start, state[0])
-        refuse_tangents(*state, forces, *material)
+        refuse_forward_mode(*state, forces, *material)
         self._notices.before(self, state, material, self.time_step, report=return_info)
         positions, velocities, rows = _ops.step(
             state[0],
@@ -197,7 +197,7 @@ class Stepper(Readable):
         Returns:
             Positions and velocities [steps // every, B, V, 3], and rows for `Info.from_rows`.
         """
-        refuse_tangents(*state, forces, *material)
+        refuse_forward_mode(*state, forces, *material)
         self._notices.before(self, state, material, self.time_step, report=report)
         # the adjoint needs every state, so the op has a derivative only with every=1
         thinned = every > 1 and torch.is_grad_enabled() and _requires_grad(*state, forces, *material)
@@ -232,7 +232,7 @@ class Stepper(Readable):
             targets: of pins, as in `forward`.
         """
         positions = self.positions_of(state)
-        refuse_tangents(positions)
+        refuse_forward_mode(positions)
         arrays = self.material_at(targets, positions.shape[0])
         material = dict(zip(MATERIAL_ROWS, arrays, strict=True))
         energy = cast(Tensor, _ops.element_energy(positions, arrays, list(self.plan.arrays))).sum(-1)

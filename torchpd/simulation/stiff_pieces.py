@@ -1,7 +1,7 @@
-"""Stiff pieces of a mesh, and functions that carry their motions into the rest of it: made once, on the CPU.
+"""Rigid coarse space of stiff pieces: their affine motions, extended into the rest of the mesh; built on the CPU.
 
-Z has four functions for each piece, 1 and X - c, extended to the rest of the mesh so that the energy of A without the
-pieces' own elements is least. Only the extension is dense; it is solved for in blocks of columns.
+Z has four functions per piece, 1 and X - c. Their extension to the rest of the mesh minimises the energy of A without
+the elements of the pieces. Only the extension is dense; it is solved in blocks of columns.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ __all__ = ["StiffPieces", "find_pieces"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_CONTRAST = 100.0  # of the stiffnesses, below which there are no pieces by default
-_MOST = 256  # pieces: 1536 unknowns of a dense solve
-_BLOCK = 64  # columns that are solved for at once
-_ROW = 32  # vertices of a piece whose contributions are added up at once
+_CONTRAST = 100.0  # least ratio of stiffnesses for pieces by default
+_MOST = 256  # most pieces: 1536 unknowns of a dense solve
+_BLOCK = 64  # columns per solve
+_ROW = 32  # vertices of a piece per row
 
 
 class StiffPieces(NamedTuple):
-    """P pieces in C rows of vertices, and their functions Z on all V vertices."""
+    """P stiff pieces in C rows of vertices, and their functions Z on all V vertices."""
 
     threshold: float  # stiffness [Pa] above which an element belongs to a piece
-    vertices: list[Index]  # of each piece
-    functions: NDArray[np.floating]  # Z [V, 4 P], in the precision that was asked for
+    vertices: list[Index]  # centroid of each piece
+    functions: NDArray[np.floating]  # Z [V, 4 P], in the requested precision
     coarse: Array  # Z^T A Z [P, 4, P, 4] N/m
-    rows: Index  # vertices of a piece, 32 in a row; the last row of a piece repeats one [C, 32]
-    fits: Array  # what finds the coefficients of Z from positions of these vertices [C, 4, 32]
+    rows: Index  # vertices of a piece, 32 per row; the last row of a piece repeats one [C, 32]
+    fits: Array  # least-squares operator from positions of these vertices to coefficients of Z [C, 4, 32]
     owners: Array  # 1 where a row belongs to a piece [P, C]
 
 
@@ -50,22 +50,22 @@ def find_pieces(
     dtype: torch.dtype,
     device: torch.device,
 ) -> StiffPieces:
-    """Connected stiff elements that no hard pin holds, and their functions.
+    """Find connected stiff elements without hard pins, and their functions.
 
     Args:
         values: of the scene.
-        stiffness: of the elements [E] Pa.
-        inertia: of the vertices [V] N/m, inf where held.
+        stiffness: Young's modulus of the elements [E] Pa.
+        inertia: of the vertices [V] N/m, inf where pinned.
         stiffer_than: see `RigidPieces`.
         dtype: of the functions.
-        device: where the functions will be; memory is asked about there.
+        device: of the functions; its free memory is checked.
     """
     threshold = _threshold(stiffness, stiffer_than)
     stiff = stiffness > threshold
     label, found, held = _label_pieces(values.tets[stiff], inertia)
     if not 1 <= found <= _MOST:
         raise ValueError(_why_not(stiffness, threshold, found, held))
-    _refuse_full_memory(len(inertia), found, dtype, device)
+    _check_free_memory(len(inertia), found, dtype, device)
     pieces = _split(label, found)
     inside = label >= 0
     strained = ~(stiff & inside[values.tets[:, 0]])
@@ -84,7 +84,7 @@ def _threshold(stiffness: Array, given: float | None) -> float:
 
 
 def _label_pieces(tets: Index, inertia: Array) -> tuple[Index, int, int]:
-    """Number of the free piece of each vertex [V], -1 elsewhere; how many of them, and how many that pins hold."""
+    """Label of the free piece of each vertex [V], -1 elsewhere; counts of free and of pinned pieces."""
     count = len(inertia)
     first, other = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
     graph = coo_array((np.ones(len(first)), (first, other)), shape=(count, count))
@@ -107,35 +107,35 @@ def _why_not(stiffness: Array, threshold: float, free: int, held: int) -> str:
     span = f"the elements have {stiffness.min():g} to {stiffness.max():g} Pa"
     if np.isinf(threshold):
         return (
-            f"RigidPieces: {span}, and without stiffer_than there are pieces only where that spans a factor of "
-            f"{_CONTRAST:g}; give stiffer_than [Pa], or use the simulator alone"
+            f"RigidPieces: stiffer_than has a default only for a stiffness ratio of {_CONTRAST:g}, and {span}; give "
+            "stiffer_than [Pa], or use the simulator alone"
         )
     return (
-        f"RigidPieces: there must be 1 to {_MOST} connected pieces that no hard pin holds; {span}, and stiffer than "
-        f"{threshold:g} Pa are {free + held} pieces, of which hard pins hold {held}; choose another stiffer_than [Pa], "
-        "or use the simulator alone"
+        f"RigidPieces: there must be 1 to {_MOST} connected pieces without hard pins, got {free + held} stiffer than "
+        f"{threshold:g} Pa, {held} of them with hard pins; {span}. Choose another stiffer_than [Pa], or use the "
+        "simulator alone"
     )
 
 
-def _refuse_full_memory(vertices: int, pieces: int, dtype: torch.dtype, device: torch.device) -> None:
-    """Where the functions cannot be kept at all; the factor of the surroundings comes on top."""
+def _check_free_memory(vertices: int, pieces: int, dtype: torch.dtype, device: torch.device) -> None:
+    """Raise an error if the functions do not fit in memory; the factor of the surroundings needs more."""
     needed = 4 * vertices * pieces * dtype.itemsize
     for place in {torch.device("cpu"), device}:
         there = _memory(place)
         if needed > there:
             raise ValueError(
-                f"RigidPieces: {pieces} pieces among {vertices:,} vertices need {needed:,} B of memory and the "
-                f"{place.type} has {there:,} B; choose stiffer_than [Pa] for fewer pieces, or a coarser mesh"
+                f"RigidPieces: {pieces} pieces of {vertices:,} vertices need {needed:,} B of memory, and {place.type} "
+                f"has {there:,} B; choose stiffer_than [Pa] for fewer pieces, or a coarser mesh"
             )
 
 
 def _memory(device: torch.device) -> int:
-    """Bytes: all that the host may give to this process, and what is free on a GPU."""
+    """Total memory of the host available to this process, or free memory of a GPU, in bytes."""
     return free_memory(device) if device.type == "cuda" else host_memory()
 
 
 def _matrix(values: SceneValues, stiffness: Array, inertia: Array) -> csr_array:
-    """A of projective dynamics [V, V] N/m, with zero for the inertia of what is held."""
+    """Matrix A of projective dynamics [V, V] N/m, with zero inertia at pinned vertices."""
     corners = values.rest_positions[values.tets]
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
     inner = np.linalg.inv(edges)
@@ -148,7 +148,7 @@ def _matrix(values: SceneValues, stiffness: Array, inertia: Array) -> csr_array:
 
 
 def _motions(rest: Array) -> Array:
-    """1 and X - c of a piece [n, 4], of the size of 1."""
+    """Affine functions 1 and X - c of a piece [n, 4], scaled to order 1."""
     arms = rest - rest.mean(axis=0)
     return np.column_stack([np.ones(len(rest)), arms / np.abs(arms).max()])
 
@@ -163,9 +163,9 @@ def _placed(pieces: list[Index], motions: list[Array], count: int) -> csc_array:
 def _functions(
     placed: csc_array, matrix: csr_array, others: Index, dtype: torch.dtype
 ) -> tuple[NDArray[np.floating], Array]:
-    """Z [V, 4 P] in a precision, and Z^T A Z [4 P, 4 P] N/m.
+    """Z [V, 4 P] in the requested precision, and Z^T A Z [4 P, 4 P] N/m.
 
-    On the others A_oo Z_o = -A_op Z_p, so that Z^T A Z = Z_p^T (A_pp Z_p + A_po Z_o).
+    On the other vertices A_oo Z_o = -A_op Z_p, so that Z^T A Z = Z_p^T (A_pp Z_p + A_po Z_o).
     """
     columns = placed.shape[1]
     functions = placed.astype(torch.empty(0, dtype=dtype).numpy().dtype).toarray(order="C")
@@ -183,7 +183,7 @@ def _functions(
 
 
 def _fits(pieces: list[Index], motions: list[Array]) -> tuple[Index, Array, Array]:
-    """Rows, fits and owners of `StiffPieces`: the least squares fit of Z to positions of each piece."""
+    """Rows, fits and owners of `StiffPieces`: the least-squares fit of Z to positions of each piece."""
     rows, fits = [], []
     for piece, motion in zip(pieces, motions, strict=True):
         room = -len(piece) % _ROW

@@ -1,4 +1,4 @@
-"""Formats of surfaces: what they are called, and their readers."""
+"""Readers of surface formats, with the names of the formats."""
 
 from __future__ import annotations
 

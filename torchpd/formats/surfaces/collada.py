@@ -1,4 +1,4 @@
-"""COLLADA (.dae): the meshes of the scene where its nodes put them, in metres and y up."""
+"""COLLADA (.dae): the meshes of the scene, each at the place of its node, in metres and y up."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _UP = {
 
 
 def read_collada(path: Path) -> MeshContent:
-    """All meshes of the scene of a file."""
+    """Read all meshes of the scene of a file."""
     root = xml_of(path.read_bytes())
     if root.tag.rpartition("}")[2] != "COLLADA":
         raise ValueError(f"its first element must be COLLADA, got {root.tag[:60]!r}")
@@ -45,7 +45,7 @@ def _numbers(element: Any, count: int) -> Array:
 
 
 def _local(node: Any) -> Array:
-    """The transform of a node [4, 4], a product of its elements in their order."""
+    """Transform of a node [4, 4]: product of its elements in their order."""
     matrix = np.eye(4)
     for element in node:
         step = np.eye(4)
@@ -84,7 +84,7 @@ class _Reading:
         self.others: Counter[str] = Counter()
 
     def find(self, url: str | None, kind: str) -> Any:
-        """The element of a kind that a reference names."""
+        """Find the element of a kind by its reference."""
         name = url or ""
         if not name.startswith("#"):
             raise ValueError(f"it refers to {name[:80]!r}, which is not within the file and is not read")
@@ -96,7 +96,7 @@ class _Reading:
         return found
 
     def scene(self) -> Any:
-        """The scene that is drawn."""
+        """The scene to draw."""
         instance = self.root.find("{*}scene/{*}instance_visual_scene")
         if instance is not None:
             return self.find(instance.get("url"), "visual_scene")
@@ -106,12 +106,12 @@ class _Reading:
         return scenes[0]
 
     def nodes_below(self, node: Any) -> list[Any]:
-        """The nodes of a node, of its own and of elsewhere."""
+        """Child nodes of a node, its own and referenced ones."""
         instances = node.iterfind("{*}instance_node")
         return [*node.iterfind("{*}node"), *(self.find(instance.get("url"), "node") for instance in instances)]
 
     def take(self, node: Any, above: Array) -> None:
-        """Add the meshes of a node and of those below it."""
+        """Add the meshes of a node and of its descendants."""
         matrix = above @ _local(node)
         for below in self.nodes_below(node):
             self.take(below, matrix)
@@ -162,7 +162,7 @@ class _Reading:
         return MeshContent(points, self.cells, join_uvs(self.uvs, notes), notes, declared)
 
     def _axes(self, notes: list[str]) -> Array:
-        """The matrix from the numbers of the file to metres with y up [3, 3]."""
+        """Matrix from the numbers of the file to metres with y up [3, 3]."""
         unit = self.root.find("{*}asset/{*}unit")
         scale = float(unit.get("meter", "1")) if unit is not None else 1.0
         if not 0.0 < scale < np.inf:

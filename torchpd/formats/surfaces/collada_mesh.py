@@ -1,4 +1,4 @@
-"""A mesh of a COLLADA file: its sources, and faces of all kinds of primitives."""
+"""A mesh of a COLLADA file: its sources, and faces of all primitives."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FACES = ("triangles", "polylist", "polygons", "trifans", "tristrips")
 
 @dataclass
 class Mesh:
-    """Points [N, 3], corners of all faces and how many each has, texture coordinates [N, 2] or None."""
+    """Points [N, 3], corners of all faces and corner count of each, texture coordinates [N, 2] or None."""
 
     points: Array
     corners: Index
@@ -29,13 +29,13 @@ class Mesh:
     uvs: Array | None
 
     def placed(self, first: int, *, turned: bool) -> list[Cells]:
-        """The faces with vertex numbers from `first` on, each from its last corner to its first where turned."""
+        """The faces with vertex numbers from `first` on, reversed if `turned`."""
         corners = turn_faces(self.corners, self.sizes) if turned else self.corners
         return face_blocks(corners + first, self.sizes, [])
 
 
 def read_mesh(mesh: Any, find: _Find, others: Counter[str]) -> Mesh:
-    """The faces of a mesh; what is no face is counted in `others`."""
+    """Read the faces of a mesh; other primitives are counted in `others`."""
     places = mesh.find("{*}vertices/{*}input[@semantic='POSITION']")
     if places is None:
         raise ValueError("a mesh has no positions")
@@ -71,7 +71,7 @@ def read_mesh(mesh: Any, find: _Find, others: Counter[str]) -> Mesh:
 
 
 def _source(source: Any, width: int) -> Array:
-    """The first columns of the rows of a source."""
+    """The first `width` columns of the rows of a source."""
     array = source.find("{*}float_array")
     accessor = source.find("{*}technique_common/{*}accessor")
     if array is None or accessor is None:
@@ -90,7 +90,7 @@ def _source(source: Any, width: int) -> Array:
 
 
 def _rows(element: Any, name: str) -> tuple[Index, Index, dict[str, tuple[int, str | None]]]:
-    """For each corner the number in each source [n, inputs], the size of each face, and offset and source of inputs."""
+    """For each corner its number in each source [n, inputs]; face sizes; and offset and source of the inputs."""
     inputs: dict[str, tuple[int, str | None]] = {}
     width = 1
     for row in element.iterfind("{*}input"):
@@ -125,7 +125,7 @@ def _rows(element: Any, name: str) -> tuple[Index, Index, dict[str, tuple[int, s
 
 
 def _pick(rows: Index, pieces: Callable[[Index], Index], inputs: dict[str, tuple[int, str | None]]) -> Index:
-    """The rows of the corners of the triangles of a strip or a fan."""
+    """Rows of the triangle corners of a strip or a fan."""
     vertices = rows[:, inputs["VERTEX"][0]] if "VERTEX" in inputs else np.arange(len(rows))
     triangles = pieces(np.arange(len(rows)))
     a, b, c = vertices[triangles].T

@@ -1,4 +1,4 @@
-"""Faces of a surface file: checked corners, blocks by kind, and texture coordinates that become one a vertex."""
+"""Faces of a surface file: checked corners, blocks by kind, and one texture coordinate per vertex."""
 
 from __future__ import annotations
 
@@ -27,36 +27,36 @@ __all__ = [
 
 
 def check_instances(count: int) -> None:
-    """Refuse scenes that name parts of parts without end: twenty names of two parts each are a million parts."""
+    """Refuse scenes with endlessly nested parts: twenty levels of two references each are a million parts."""
     if count > MOST_INSTANCES:
-        raise ValueError(f"it has more than {MOST_INSTANCES:,} instances, some of them of each other's parts")
+        raise ValueError(f"it has more than {MOST_INSTANCES:,} instances, some of them nested")
 
 
 def check_tree(roots: Iterable[Hashable], parts_of: Callable[[Any], Iterable[Hashable]]) -> None:
-    """Refuse parts that are parts of themselves, and, before they are placed, more instances than can be."""
-    sizes: dict[Hashable, int] = {}  # 0: being counted
+    """Refuse parts that contain themselves and, before they are placed, too many instances."""
+    sizes: dict[Hashable, int] = {}  # 0: in progress
 
     def size(part: Hashable) -> int:
         if part not in sizes:
             sizes[part] = 0
             sizes[part] = 1 + sum(size(inner) for inner in parts_of(part))
         elif not sizes[part]:
-            raise ValueError("one of its parts is a part of itself")
+            raise ValueError("one of its parts contains itself")
         return sizes[part]
 
     check_instances(sum(size(root) for root in roots))
 
 
 def left_out(others: Mapping[str, int]) -> list[str]:
-    """A note that names what of a file is not among its cells, with its number; none if there is nothing."""
+    """Note that counts the omitted objects of a file by name; empty if there are none."""
     return ["left out: " + ", ".join(f"{kind} ({count:,})" for kind, count in others.items())] if others else []
 
 
-MOST_INSTANCES = 100_000  # of nodes or components of a scene
+MOST_INSTANCES = 100_000  # nodes or components of a scene
 
 
 def check_corners(corners: Index, count: int, nouns: str = "vertices", first: int = 0) -> None:
-    """Refuse numbers that name nothing; `first` is the number that the file gives to the first vertex."""
+    """Refuse numbers of missing vertices; `first` is the file's number of the first vertex."""
     bad = np.flatnonzero((corners < 0) | (corners >= count))
     if bad.size:
         raise ValueError(
@@ -66,7 +66,7 @@ def check_corners(corners: Index, count: int, nouns: str = "vertices", first: in
 
 
 def face_blocks(corners: Index, sizes: Index, notes: list[str]) -> list[Cells]:
-    """Faces in the order of the file as one block of triangles, quads or polygons; fewer than 3 corners are noted."""
+    """Faces in the order of the file as one block of triangles, quads or polygons; smaller faces are noted."""
     few = sizes < 3
     if few.any():
         notes += left_out({"faces with fewer than 3 corners": int(few.sum())})
@@ -78,7 +78,7 @@ def face_blocks(corners: Index, sizes: Index, notes: list[str]) -> list[Cells]:
 
 
 def strip_triangles(strip: Index) -> Index:
-    """The triangles of a strip [n], with one winding; where it turns it names a vertex twice, which is no triangle."""
+    """Triangles of a strip [n] with consistent winding; restarts give triangles with a repeated vertex."""
     if len(strip) < 3:
         return np.empty((0, 3), np.int64)
     triangles = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
@@ -89,20 +89,20 @@ def strip_triangles(strip: Index) -> Index:
 
 
 def fan_triangles(fan: Index) -> Index:
-    """The triangles of a fan [n] around its first vertex: [n - 2, 3]."""
+    """Triangles of a fan [n] around its first vertex: [n - 2, 3]."""
     if len(fan) < 3:
         return np.empty((0, 3), np.int64)
     return np.stack([np.broadcast_to(fan[0], len(fan) - 2), fan[1:-1], fan[2:]], axis=1)
 
 
 def one_uv_each(points: Array, corners: Index, numbers: Index, uvs: Array) -> tuple[Array, Index, Array]:
-    """Points, corners and uvs with one texture coordinate for each vertex.
+    """Duplicate vertices until each has one texture coordinate; returns points, corners and uvs.
 
     Corner k has point `corners[k]` and texture coordinate `numbers[k]`. Vertices keep their numbers and take their
-    first texture coordinate; a copy of the vertex at the end takes each further one.
+    first texture coordinate. A copy of the vertex at the end takes each further one.
     """
     pairs, first, inverse = np.unique(corners * len(uvs) + numbers, return_index=True, return_inverse=True)
-    order = np.argsort(first)  # pairs as they appear
+    order = np.argsort(first)  # pairs in order of appearance
     vertex, number = np.divmod(pairs[order], len(uvs))
     leads = np.zeros(len(pairs), dtype=bool)
     leads[np.unique(vertex, return_index=True)[1]] = True
@@ -115,13 +115,13 @@ def one_uv_each(points: Array, corners: Index, numbers: Index, uvs: Array) -> tu
 
 
 def turn_faces(corners: Index, sizes: Index) -> Index:
-    """The corners of each face from its last to its first."""
+    """Reverse the corners of each face."""
     begins = np.repeat(np.cumsum(sizes) - sizes, sizes)
     return corners[2 * begins + np.repeat(sizes, sizes) - 1 - np.arange(len(corners))]
 
 
 def join_uvs(parts: Sequence[Array | None], notes: list[str]) -> Array | None:
-    """The texture coordinates of all parts of a scene; None, which is noted, where only some have them."""
+    """Texture coordinates of all parts of a scene; None, with a note, if only some parts have them."""
     found = [part for part in parts if part is not None]
     if found and len(found) < len(parts):
         notes.append(f"texture coordinates left out: {len(parts) - len(found)} of its {len(parts)} parts have none")
@@ -130,5 +130,5 @@ def join_uvs(parts: Sequence[Array | None], notes: list[str]) -> Array | None:
 
 
 def join(parts: Sequence[Index]) -> Index:
-    """One array of all, also of none."""
+    """Concatenate arrays; an empty list is allowed."""
     return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)

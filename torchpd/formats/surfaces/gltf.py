@@ -1,4 +1,4 @@
-"""glTF 2.0, .gltf and .glb: the triangles of the default scene, each mesh where its nodes put it, in metres, y up."""
+"""glTF 2.0, .gltf and .glb: the triangles of the default scene, each mesh at its node, in metres, y up."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from .gltf_buffers import Document
 
 __all__ = ["read_gltf"]
 
-_Node = tuple[int, Array]  # its number, and the transform of what is above it
+_Node = tuple[int, Array]  # its number, and the transform of its parent
 
-# Extensions that change no position: materials, textures, lights, names, data about data.
+# extensions that change no position: materials, textures, lights, names, metadata
 _HARMLESS = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "EXT_lights_", "KHR_xmp")
 _READ = ("KHR_mesh_quantization",)
 _ADVICE = {
@@ -30,7 +30,7 @@ _POINTS_AND_LINES = {0: "points", 1: "lines", 2: "line loops", 3: "line strips"}
 
 
 def read_gltf(path: Path) -> MeshContent:
-    """The triangles of all nodes of the default scene (without one: of all nodes)."""
+    """Read the triangles of all nodes of the default scene (without one: of all nodes)."""
     document = Document.load(path)
     for name in document.names("extensionsRequired"):
         if name not in _READ and not name.startswith(_HARMLESS):
@@ -43,7 +43,7 @@ def read_gltf(path: Path) -> MeshContent:
 
 
 def _nodes(document: Document, notes: list[str]) -> list[tuple[dict[str, Any], Array]]:
-    """Every node of the scene with its transform [4, 4] to the scene's axes."""
+    """Every node of the scene with its transform [4, 4] to the axes of the scene."""
     nodes, scenes = document.items("nodes"), document.items("scenes")
     children = {child for node in nodes for child in document.numbers(node, "children")}
     if "scene" in document.root:
@@ -71,7 +71,7 @@ def _nodes(document: Document, notes: list[str]) -> list[tuple[dict[str, Any], A
 
 
 def _local(node: dict[str, Any], number: int) -> Array:
-    """The transform of a node [4, 4] from its matrix (by columns) or its translation, rotation and scale."""
+    """Transform of a node [4, 4] from its matrix (by columns) or its translation, rotation and scale."""
 
     def values(name: str, default: list[float]) -> Array:
         array = np.array(node.get(name, default), dtype=np.float64)
@@ -157,7 +157,7 @@ class _Reading:
             corners = np.arange(len(points))
         check_corners(corners, len(points), "vertices of a primitive")
         triangles = self._triangles(corners, mode)
-        # A reflection turns triangles round; the winding of the file belongs to the axes of the node.
+        # A reflection reverses triangles: the winding in the file is that of the node's axes.
         if np.linalg.det(transform[:3, :3]) < 0:
             triangles = triangles[:, ::-1]
         self.triangles.append(triangles + offsets[key])
@@ -177,7 +177,7 @@ class _Reading:
             coordinates = self.document.accessor(texture, ("VEC2",)).astype(np.float64)
             if len(coordinates) != len(points):
                 raise ValueError(f"{len(points)} positions of a primitive have {len(coordinates)} texture coordinates")
-            coordinates[:, 1] = 1.0 - coordinates[:, 1]  # glTF counts down from the upper edge of a picture
+            coordinates[:, 1] = 1.0 - coordinates[:, 1]  # glTF counts down from the upper edge of an image
         self.points.append(points.astype(np.float64) @ transform[:3, :3].T + transform[:3, 3])
         self.uvs.append(coordinates)
         self.count += len(points)

@@ -1,4 +1,4 @@
-"""The JSON of a glTF and the numbers in its buffers, every reference and length checked."""
+"""JSON of a glTF and the numbers in its buffers, with every reference and length checked."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Document:
     root: Table
     chunk: bytes | None
     folder: Path
-    size: int  # of the file [bytes]
+    size: int  # size of the file [bytes]
     _buffers: dict[int, bytes] = field(default_factory=dict)
     _accessors: dict[int, NDArray[Any]] = field(default_factory=dict)
 
@@ -51,14 +51,14 @@ class Document:
         return cls(root, chunk, path.parent, len(data))
 
     def items(self, name: str, table: Table | None = None) -> list[Table]:
-        """A list of objects of the JSON, or of one of its objects; none where there is no such list."""
+        """A list of objects in the JSON or in one of its objects; empty if there is no such list."""
         found = (self.root if table is None else table).get(name, [])
         if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
             raise ValueError(f"{name} must be a list of objects")
         return found
 
     def item(self, name: str, number: Any) -> Table:
-        """One of a list of the JSON, by its number."""
+        """An item of a list in the JSON, by its number."""
         items = self.items(name)
         if type(number) is not int or not 0 <= number < len(items):
             raise ValueError(f"{name} {number!r} is named, but there are {len(items)}, counted from 0")
@@ -77,7 +77,7 @@ class Document:
         return [str(item) for item in found]
 
     def accessor(self, number: Any, kinds: tuple[str, ...]) -> NDArray[Any]:
-        """The rows of an accessor [count, width]: whole numbers as int64, others and normalised ones as float64."""
+        """Rows of an accessor [count, width]: whole numbers as int64, others and normalised ones as float64."""
         table = self.item("accessors", number)
         if table.get("type") not in kinds:
             raise ValueError(f"accessor {number} must be {' or '.join(kinds)}, got {table.get('type')!r}")
@@ -106,7 +106,7 @@ class Document:
         return rows.astype(np.float64 if code == "<f4" else np.int64)
 
     def _replace_rows(self, rows: NDArray[Any], sparse: Any, name: str) -> None:
-        """Put the rows of a sparse accessor in their places."""
+        """Write the rows of a sparse accessor to their places."""
         if not isinstance(sparse, dict) or not all(isinstance(sparse.get(k), dict) for k in ("indices", "values")):
             raise ValueError(f"sparse of {name} must hold indices and values")
         count = _length(sparse, "count", name)
@@ -119,7 +119,7 @@ class Document:
         rows[places] = self._rows(sparse["values"], rows.dtype, rows.shape[1], count, name)
 
     def _rows(self, table: Table, kind: np.dtype[Any], width: int, count: int, name: str) -> NDArray[Any]:
-        """Rows of a bufferView [count, width], a stride apart, all of which must be there."""
+        """Rows of a bufferView [count, width], at its stride; all must be in the buffer."""
         view = self.item("bufferViews", table.get("bufferView"))
         if {"EXT_meshopt_compression", "KHR_meshopt_compression"} & set(view.get("extensions", {})):
             raise ValueError(f"{name} is compressed by meshopt; decompress the file, as with gltf-transform")
@@ -180,7 +180,7 @@ def _length(table: Table, key: str, name: str, default: int | None = None) -> in
 
 
 def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    """The JSON and the binary chunk of a .glb."""
+    """JSON and binary chunk of a .glb."""
     version, total = struct.unpack("<II", data[4:12]) if len(data) >= 12 else (2, 12)
     if version != 2:
         raise ValueError(f"version 2 of the .glb container is read, got {version}")

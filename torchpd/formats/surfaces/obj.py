@@ -1,7 +1,7 @@
 """Wavefront OBJ: vertices, faces and texture coordinates of all objects and groups.
 
-Read from bytes, so that comments and names may be in any encoding. Numbers count from 1, negative ones back from the
-line in which they stand (appendix B1 of Wavefront's Advanced Visualizer manual).
+Read from bytes, so that comments and names may be in any encoding. Numbers count from 1. Negative ones count back from
+the line in which they stand (appendix B1 of Wavefront's Advanced Visualizer manual).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .faces import check_corners, face_blocks, left_out, one_uv_each
 __all__ = ["read_obj"]
 
 _OTHER = {b"l": "lines", b"p": "points", b"curv": "curves", b"curv2": "curves", b"surf": "free-form surfaces"}
-# Names, materials, normals and the parameters of free-form geometry: they change no face.
+# names, materials, normals and free-form parameters, which change no face
 _BESIDE = frozenset(
     b"vn vp g o s mg usemtl usemap mtllib maplib bevel c_interp d_interp lod shadow_obj trace_obj ctech stech cstype "
     b"deg bmat step parm trim hole scrv sp end con bzp bsp cdc cdp res".split()
@@ -29,7 +29,7 @@ _BESIDE = frozenset(
 
 
 def read_obj(path: Path) -> MeshContent:
-    """All faces of a file; vertices keep their order, with copies at the end where one has several uvs."""
+    """Read all faces of a file; vertices keep their order, with copies at the end for further uvs."""
     reading = _Reading()
     try:
         for reading.line, words in _lines(path.read_bytes()):
@@ -40,7 +40,7 @@ def read_obj(path: Path) -> MeshContent:
 
 
 def _lines(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
-    """Number and words of each line that is no comment, continued lines joined."""
+    """Number and words of each line that is no comment; continued lines are joined."""
     for mark, encoding in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
         if data.startswith(mark):
             data = data.decode(encoding, errors="replace").encode()
@@ -57,14 +57,14 @@ def _lines(data: bytes) -> Iterator[tuple[int, list[bytes]]]:
 
 
 class _Reading:
-    """What the lines so far hold."""
+    """Content of the lines so far."""
 
     def __init__(self) -> None:
         self.line = 0
         self.points = array("d")
         self.uvs = array("d")
         self.corners = array("q")
-        self.numbers = array("q")  # of the texture coordinates, at the corners of faces that have them all
+        self.numbers = array("q")  # texture coordinates at the corners of faces that have them all
         self.sizes = array("q")
         self.plain = 0  # faces without texture coordinates
         self.others: Counter[str] = Counter()
@@ -123,7 +123,7 @@ def _numbers(words: list[bytes], count: int) -> list[float]:
 
 
 def _texture(words: list[bytes]) -> list[float]:
-    """Two texture coordinates; what is none, as "nan(ind)", costs them, but not the surface."""
+    """Parse two texture coordinates; a faulty one such as "nan(ind)" drops them, but not the surface."""
     try:
         return [float(word) for word in (words + [b"0"])[:2]] if words else [nan, nan]
     except ValueError:
@@ -131,7 +131,7 @@ def _texture(words: list[bytes]) -> list[float]:
 
 
 def _counted(words: list[bytes], so_far: int, noun: str) -> list[int]:
-    """Numbers from 0, of which negative ones count back from the last one so far."""
+    """Convert to numbers from 0; negative ones count back from the last one so far."""
     values = [int(word) for word in words]
     if min(values) < 0:
         values = [so_far + value + 1 if value < 0 else value for value in values]

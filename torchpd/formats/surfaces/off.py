@@ -1,4 +1,4 @@
-"""OFF, the format of Geomview: vertices and polygons in text, with colours, normals and texture coordinates or not."""
+"""OFF, the text format of Geomview: vertices and polygons, with optional colours, normals and texture coordinates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _Line = tuple[int, list[bytes]]
 
 
 def read_off(path: Path) -> MeshContent:
-    """All faces of a file, a vertex and a face each on a line of its own."""
+    """Read all faces of a file, with one vertex or face per line."""
     lines = [
         (number, words)
         for number, line in enumerate(path.read_bytes().removeprefix(b"\xef\xbb\xbf").splitlines(), start=1)
@@ -45,7 +45,7 @@ def _head(lines: list[_Line]) -> tuple[bool, list[_Line]]:
     match = re.fullmatch(rb"(ST)?C?N?(4?n?)OFF(\d*)", word, flags=re.IGNORECASE)
     if not match:
         raise ValueError(f"line {number}: the word 'OFF' must come first, got {word[:20].decode('ascii', 'replace')!r}")
-    if match.group(3):  # ModelNet's files leave out the blank
+    if match.group(3):  # ModelNet's files omit the blank
         rest.insert(0, match.group(3))
     if match.group(2) or b"BINARY" in rest:
         raise ValueError("only OFF files of text, with three coordinates a vertex, are read; write it as plain OFF")
@@ -64,7 +64,7 @@ def _counts(lines: list[_Line]) -> tuple[int, int]:
 
 
 def _table(lines: list[_Line], with_uvs: bool) -> Array:
-    """Coordinates of each vertex [n, 3], followed by its texture coordinates [n, 2], which end a line."""
+    """Coordinates of each vertex [n, 3], and its texture coordinates [n, 2] from the end of its line."""
     values, width, line = array("d"), 5 if with_uvs else 3, 0
     try:
         for number, words in lines:
@@ -78,7 +78,7 @@ def _table(lines: list[_Line], with_uvs: bool) -> Array:
 
 
 def _polygons(lines: list[_Line]) -> tuple[Index, Index]:
-    """Corners of all faces and how many each has; a colour may follow on the line."""
+    """Corners of all faces, and corner count of each; a colour may follow on the line."""
     corners, sizes = array("q"), array("q")
     line = 0
     try:

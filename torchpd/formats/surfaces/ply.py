@@ -31,8 +31,8 @@ _CORNERS = ("vertex_indices", "vertex_index")
 @dataclass
 class _Property:
     name: str
-    kind: str  # a code of NumPy, without byte order
-    counter: str = ""  # of a list: the code of its length
+    kind: str  # NumPy type code, without byte order
+    counter: str = ""  # list: type code of its length
 
 
 @dataclass
@@ -40,15 +40,15 @@ class _Element:
     name: str
     count: int
     properties: list[_Property] = field(default_factory=list)
-    values: dict[str, NDArray[Any]] = field(default_factory=dict)  # of a list: all items, one row after another
-    sizes: dict[str, Index] = field(default_factory=dict)  # of a list: how many items each row has
+    values: dict[str, NDArray[Any]] = field(default_factory=dict)  # list: all items, one row after another
+    sizes: dict[str, Index] = field(default_factory=dict)  # list: number of items of each row
 
     def find(self, names: tuple[str, ...]) -> str | None:
         return next((name for name in names if name in self.values), None)
 
 
 def read_ply(path: Path) -> MeshContent:
-    """Vertices, faces and strips of a file; whatever else it holds is skipped, and named when it has rows."""
+    """Read vertices, faces and strips of a file; other elements are skipped, and noted if they have rows."""
     order, elements, body = _head(path.read_bytes())
     rest = _read_text(body, elements) if order == "" else _read_binary(body, elements, order)
     if rest:
@@ -57,7 +57,7 @@ def read_ply(path: Path) -> MeshContent:
 
 
 def _head(data: bytes) -> tuple[str, list[_Element], bytes]:
-    """Byte order ("" of a text), the elements that the head declares, and what follows the head."""
+    """Byte order ("" for text), elements declared in the head, and the data after the head."""
     last = re.search(rb"(?<=[\r\n])end_header", data)
     if not data.startswith(b"ply") or last is None:
         raise ValueError("a PLY begins with 'ply' and has a line 'end_header'; the file is empty, cut off or no PLY")
@@ -92,7 +92,7 @@ def _head(data: bytes) -> tuple[str, list[_Element], bytes]:
 
 
 def _read_text(body: bytes, elements: list[_Element]) -> str:
-    """Fill the elements from a text, as from bytes that hold nothing but doubles; what is left over."""
+    """Fill the elements from a text of doubles; returns the rest of it."""
     try:
         numbers = np.array(body.split(), dtype="<f8")
     except ValueError as error:
@@ -103,7 +103,7 @@ def _read_text(body: bytes, elements: list[_Element]) -> str:
 
 
 def _read_binary(body: bytes, elements: list[_Element], order: str, unit: str = "bytes") -> str:
-    """Fill the elements one after another; what is left over."""
+    """Fill the elements one after another; returns the rest of the bytes."""
     place, width = 0, 8 if unit == "numbers" else 1
     for element in elements:
         left = len(body) - place
@@ -118,7 +118,7 @@ def _read_binary(body: bytes, elements: list[_Element], order: str, unit: str = 
 
 
 def _fill_alike(element: _Element, body: bytes, place: int, order: str) -> int:
-    """Fill an element whose lists are as long in every row as in the first; where it ends, or 0 if they are not."""
+    """Fill an element if all rows have lists as long as the first; returns the end, or 0 otherwise."""
     lengths, offsets, row = [], [], 0
     for p in element.properties:
         length = 1
@@ -148,7 +148,7 @@ def _fill_alike(element: _Element, body: bytes, place: int, order: str) -> int:
 
 
 def _fill_each(element: _Element, body: bytes, place: int, order: str) -> int:
-    """Fill an element row by row; where it ends."""
+    """Fill an element row by row; returns the end."""
     begins: list[array[int]] = [array("q") for _ in element.properties]
     lengths: list[array[int]] = [array("q") for _ in element.properties]
     steps = [(np.dtype(p.counter).itemsize if p.counter else 0, np.dtype(p.kind).itemsize) for p in element.properties]
@@ -171,7 +171,7 @@ def _fill_each(element: _Element, body: bytes, place: int, order: str) -> int:
 
 
 def _length(element: _Element, body: bytes, place: int, code: str) -> int:
-    """How many items the list has that begins at a place."""
+    """Number of items of the list that begins at a place."""
     kind = np.dtype(code)
     if place + kind.itemsize > len(body):
         raise ValueError(f"the rows of its element {element.name!r} go on beyond its end; it was cut off")
@@ -206,7 +206,7 @@ def _columns(vertex: _Element, names: tuple[str, str]) -> Array:
 
 
 def _whole(element: _Element, name: str, count: int) -> Index:
-    """The vertex numbers of a list, checked."""
+    """Check the vertex numbers of a list."""
     values = element.values[name]
     if not (np.abs(values.astype(np.float64)) < 2.0**53).all() or (values != values.astype(np.int64)).any():
         raise ValueError(f"{name} of its element {element.name!r} must be vertex numbers, got {values.max()}")
@@ -216,7 +216,7 @@ def _whole(element: _Element, name: str, count: int) -> Index:
 
 
 def _with_faces(content: MeshContent, face: _Element) -> MeshContent:
-    """The faces added, and their own texture coordinates (a list of u, v of every corner) if there are any."""
+    """Add the faces; returns their own texture coordinates (a list of u, v of every corner), if any."""
     name = face.find(_CORNERS)
     if name is None or name not in face.sizes:
         raise ValueError(f"its faces must have a list vertex_indices, got {', '.join(face.values)}")
@@ -233,7 +233,7 @@ def _with_faces(content: MeshContent, face: _Element) -> MeshContent:
 
 
 def _strips(element: _Element, count: int) -> list[Cells]:
-    """The triangles of strips; -1 begins a new strip."""
+    """Triangles of strips; -1 begins a new strip."""
     name = element.find(_CORNERS) or ""
     numbers = np.split(_whole(element, name, count), np.cumsum(element.sizes[name])[:-1])
     runs = [run[run >= 0] for strip in numbers for run in np.split(strip, np.flatnonzero(strip == -1))]

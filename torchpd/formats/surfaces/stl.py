@@ -1,4 +1,4 @@
-"""STL, binary and text: triangles whose equal corners become one vertex."""
+"""STL, binary and text; equal corners of triangles become one vertex."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ..content import Array, Cells, MeshContent
 __all__ = ["read_stl"]
 
 _ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_HEAD = 80  # bytes, before the number of triangles
-# What a facet consists of, a line each; "outer loop" and "endloop" are told by their first words.
+_HEAD = 80  # bytes before the number of triangles
+# lines of a facet; "outer loop" and "endloop" are recognised by their first words
 _FACET = [b"facet", b"outer", b"vertex", b"vertex", b"vertex", b"endloop", b"endfacet"]
 
 
 def read_stl(path: Path) -> MeshContent:
-    """The triangles of all solids of a file; a binary file may begin with "solid" too."""
+    """Read the triangles of all solids of a file; a binary file may begin with "solid" too."""
     data = path.read_bytes()
     text = data.removeprefix(codecs.BOM_UTF8)
     declared = int.from_bytes(data[_HEAD : _HEAD + 4], "little")
@@ -69,7 +69,7 @@ def _read_text(data: bytes) -> Array:
 
 
 def _merge(points: Array) -> tuple[Array, np.ndarray[tuple[int, ...], np.dtype[np.int64]]]:
-    """Equal points as one, in the order in which they first appear, and the new number of each."""
+    """Unique points in order of first appearance, and the new number of each."""
     points = points + 0.0  # -0.0 becomes 0.0
     keys = np.ascontiguousarray(points).view(np.dtype((np.void, points.itemsize * 3))).reshape(-1)
     _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)

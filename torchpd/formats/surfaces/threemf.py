@@ -1,4 +1,4 @@
-"""3MF: the meshes of all items of the build, where their transforms put them, in metres; axes are as in the file."""
+"""3MF: the meshes of all build items, at the places of their transforms, in metres; axes are as in the file."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .faces import check_corners, check_tree, join, left_out
 __all__ = ["read_3mf"]
 
 _UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254, "foot": 0.3048, "meter": 1.0}
-# Ends of the namespaces of extensions that are read (production) or change no position (materials).
+# namespace suffixes of extensions that are read (production) or change no position (materials)
 _EXTENSIONS = ("/production/2015/06", "/material/2015/02")
 _SUPPORT = "support"
 
-_Key = tuple[str, str]  # the part of the package that an object is in, and its number there
+_Key = tuple[str, str]  # part of the package that holds an object, and its number there
 
 
 def read_3mf(path: Path) -> MeshContent:
-    """All items of the build; objects that are no part of it are left out."""
+    """Read all build items; other objects are omitted."""
     try:
         with zipfile.ZipFile(path) as archive:
             package = _Package(archive)
@@ -40,7 +40,7 @@ def read_3mf(path: Path) -> MeshContent:
 
 
 class _Package:
-    """The models of an archive, and their objects."""
+    """Models of an archive, and their objects."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         names = archive.namelist()
@@ -99,13 +99,13 @@ def _part(name: str) -> str:
 
 
 def _key(reference: Any, part: str) -> _Key:
-    """The object that an item or a component names; the production extension puts it in another part."""
+    """Key of the object of an item or a component; the production extension refers to other parts."""
     path = next((value for name, value in reference.attrib.items() if name.endswith("}path")), None)
     return part if path is None else _part(path), reference.get("objectid", "")
 
 
 def _transform(reference: Any) -> Array:
-    """The matrix of an item or a component [4, 3], which acts on rows (3MF core specification, section 3.3)."""
+    """Matrix of an item or a component [4, 3], acting on rows (3MF core specification, section 3.3)."""
     words = reference.get("transform", "1 0 0 0 1 0 0 0 1 0 0 0").split()
     matrix = np.array(words, dtype=np.float64)
     if matrix.shape != (12,) or not np.isfinite(matrix).all():
@@ -126,14 +126,14 @@ class _Reading:
         self.others: Counter[str] = Counter()
 
     def parts_of(self, key: _Key) -> list[_Key]:
-        """The components of an object."""
+        """Components of an object."""
         thing = self.package.objects.get(key)
         if thing is None:
             raise ValueError(f"object {key[1]!r} of {key[0]} is used, but is not there")
         return [_key(part, key[0]) for part in thing.iterfind("{*}components/{*}component")]
 
     def take(self, key: _Key, matrix: Array) -> None:
-        """Add an object, with its components."""
+        """Add an object with its components."""
         thing = self.package.objects[key]
         self.used.add(key)
         if thing.get("type") == _SUPPORT:

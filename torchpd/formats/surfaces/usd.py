@@ -1,7 +1,7 @@
 """USD (.usd, .usda, .usdc, .usdz), through usd-core: all meshes and tet meshes of a stage, in metres and y up.
 
-Numbers are multiplied by the stage's metersPerUnit, and a stage whose z axis is up is turned so that y is. What moves
-is read at its earliest time.
+Numbers are multiplied by the stage's metersPerUnit, and a z-up stage is rotated to y up. Animated prims are read at
+their earliest time.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from .usd_stage import axes_of, check_lengths, open_stage, warnings_of
 
 __all__ = ["read_usd"]
 
-# What is drawn and what stands for it: the others are guides, and stand-ins of what is there too.
+# purposes that are read; the others are guides, and proxies of prims that are read too
 _PURPOSES = ("default", "render")
 
 
 def read_usd(path: Path) -> MeshContent:
-    """The meshes and tet meshes of a file that are visible, each where its transforms put it."""
+    """Read the visible meshes and tet meshes of a file, each at the place of its transforms."""
     try:
         from pxr import Usd, UsdGeom, UsdUtils
     except ImportError:
@@ -58,12 +58,12 @@ class _Reading:
         self.uvs: list[Array | None] = []
         self.cells: list[Cells] = []
         self.count = self.prims = 0
-        self.others: Counter[str] = Counter()  # what is left out
-        self.smooth: Counter[str] = Counter()  # schemes of subdivision
+        self.others: Counter[str] = Counter()  # omitted prims
+        self.smooth: Counter[str] = Counter()  # subdivision schemes
         self.moving = 0
 
     def take(self, prim: Any) -> None:
-        """Add a mesh or a tet mesh; anything else is counted."""
+        """Add a mesh or a tet mesh; other prims are counted."""
         from pxr import UsdGeom
 
         self.prims += 1
@@ -81,12 +81,12 @@ class _Reading:
             self.others[str(prim.GetTypeName())] += 1
 
     def _values(self, attribute: Any, width: int, kind: type) -> NDArray[Any]:
-        """The rows of an attribute [n, width] at the time that is read."""
+        """Rows of an attribute [n, width] at the time of reading."""
         value = attribute.Get(self.time)
         return np.array([] if value is None else value, dtype=kind).reshape(-1, width)
 
     def _place(self, shape: Any) -> tuple[Array, bool]:
-        """The points of a prim in metres, y up, and whether the winding of its cells has to be turned."""
+        """Points of a prim in metres, y up, and whether its cells must be reversed."""
         from pxr import UsdGeom
 
         prim = shape.GetPrim()
@@ -153,7 +153,7 @@ class _Reading:
         self._add(points, None)
 
     def _regions(self, mesh: Any, count: int) -> Index | None:
-        """Subsets of the tets, numbered from 1 in the order of the file; 0 is what belongs to none."""
+        """Subsets of the tets, numbered from 1 in the order of the file; 0 for tets in none."""
         from pxr import UsdGeom
 
         subsets = UsdGeom.Subset.GetGeomSubsets(mesh, UsdGeom.Tokens.tetrahedron)
@@ -181,7 +181,7 @@ class _Reading:
 
 
 def _coordinates(prim: Any, time: Any, corners: Index, count: int) -> tuple[Index, Array] | None:
-    """For each corner the number of its texture coordinate, and these [n, 2]; None where there are none."""
+    """Number of the texture coordinate of each corner, and the coordinates [n, 2]; None without any."""
     from pxr import UsdGeom
 
     primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")

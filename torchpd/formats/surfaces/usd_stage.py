@@ -1,4 +1,4 @@
-"""A USD stage opened in silence: what usd-core would print becomes errors, and its unit and axes a matrix."""
+"""Quiet opening of a USD stage: messages of usd-core become errors, its unit and axes a matrix."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ __all__ = ["axes_of", "check_lengths", "open_stage", "warnings_of"]
 
 
 def check_lengths(path: Path) -> None:
-    """Refuse a binary layer whose table of contents names bytes that it does not have: usd-core prints, and asks."""
+    """Refuse a binary layer with sections beyond its end: usd-core would print and ask for input."""
     data = path.read_bytes()
-    # an archive (.usdz) holds its layers as they are
+    # an archive (.usdz) holds its layers uncompressed
     begins = [match.start() for match in re.finditer(b"PXR-USDC", data)] if data[:2] in (b"PX", b"PK") else []
     for begin in begins:
         layer = data[begin:]
@@ -32,17 +32,17 @@ def check_lengths(path: Path) -> None:
 
 
 def _pieces(data: bytes, size: int) -> list[bytes]:
-    """Whole pieces of a size, one after another."""
+    """Consecutive pieces of a size, without an incomplete last one."""
     return [data[k : k + size] for k in range(0, len(data) - size + 1, size)]
 
 
 def warnings_of(delegate: Any) -> list[str]:
-    """What usd-core would have printed."""
+    """Messages that usd-core would have printed."""
     return [f"usd-core: {' '.join(item.commentary.split())[:300]}" for item in delegate.TakeUncoalescedDiagnostics()]
 
 
 def open_stage(path: Path, delegate: Any) -> Any:
-    """The stage of a file; an error in the words of usd-core."""
+    """Open the stage of a file; errors are in the words of usd-core."""
     from pxr import Tf, Usd
 
     try:
@@ -58,7 +58,7 @@ def open_stage(path: Path, delegate: Any) -> Any:
 
 
 def axes_of(stage: Any) -> tuple[Array, list[str]]:
-    """The matrix from the numbers of a stage to metres with y up [3, 3], and what there is to say of it."""
+    """Matrix from the numbers of a stage to metres with y up [3, 3], and notes on it."""
     from pxr import UsdGeom
 
     matrix, notes = np.eye(3), []

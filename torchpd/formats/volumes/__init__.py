@@ -1,4 +1,4 @@
-"""Formats of volume meshes: a module each, with `read(path)`."""
+"""Readers of volume meshes, a module per format with `read(path)`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Abaqus' .inp: nodes, elements and element sets of all parts, placed as their instances say.
+"""Abaqus' .inp: nodes, elements and element sets of all parts, at the places of their instances.
 
 Format: Abaqus Keywords Reference, *NODE, *ELEMENT, *ELSET, *PART, *INSTANCE. CalculiX writes the same without parts.
 """
@@ -15,12 +15,12 @@ from .abaqus_parts import Part, Place, content_of, fields_of, read_elements, rea
 
 __all__ = ["read"]
 
-# What makes nodes and elements, or places them, in ways that are not read.
+# keywords that generate or place nodes and elements in ways that are not read
 _REFUSED = ("INCLUDE", "MANIFEST", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SUBSTRUCTURE GENERATE")
 
 
 class Keyword(NamedTuple):
-    """A keyword with its options, both in upper case, and the lines of data behind it."""
+    """A keyword with its options, both in upper case, and the data lines after it."""
 
     name: str
     options: dict[str, str]
@@ -28,7 +28,7 @@ class Keyword(NamedTuple):
 
 
 def read(path: Path) -> MeshContent:
-    """Read a file of Abaqus, or of AVS, which has the same suffix."""
+    """Read a file of Abaqus, or of AVS, which uses the same suffix."""
     text = text_of(path)
     if not any(line.startswith("*") for line in text.split("\n")):
         return avs.read(path)
@@ -72,7 +72,7 @@ def read(path: Path) -> MeshContent:
 
 
 def _of_assembly(keyword: Keyword) -> list[str]:
-    """What is lost of a keyword of the assembly: nodes there are points of reference, of no body."""
+    """Notes on an omitted keyword of the assembly: its nodes are reference points of no body."""
     if keyword.name == "ELEMENT":
         kind = keyword.options.get("TYPE", "?")
         return [f"{len(keyword.lines)} lines of elements of type {kind}, which join instances, left out"]
@@ -82,7 +82,7 @@ def _of_assembly(keyword: Keyword) -> list[str]:
 
 
 def _keywords(text: str) -> list[Keyword]:
-    """All keywords; a keyword line that ends with a comma goes on in the next line."""
+    """Parse all keywords; a keyword line that ends with a comma continues in the next line."""
     found: list[Keyword] = []
     open_line = ""
     for raw in text.split("\n"):
@@ -110,8 +110,8 @@ def _keywords(text: str) -> list[Keyword]:
 def _refuse(keyword: Keyword) -> None:
     name, options = keyword.name, keyword.options
     if name in _REFUSED:
-        told = "".join(f", {key}={value}" for key, value in options.items())
-        raise ValueError(f"*{name}{told} is not read; write nodes and elements out in the file itself")
+        listed = "".join(f", {key}={value}" for key, value in options.items())
+        raise ValueError(f"*{name}{listed} is not read; write nodes and elements out in the file itself")
     if name in ("NODE", "ELEMENT") and "INPUT" in options:
         raise ValueError(f"*{name}, INPUT={options['INPUT']} names another file, which is not read; put it in")
     if name == "NODE" and options.get("SYSTEM", "R").upper() not in ("R", ""):

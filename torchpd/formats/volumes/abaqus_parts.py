@@ -1,4 +1,4 @@
-"""Parts of an Abaqus file: their nodes, elements and sets, and where their instances stand."""
+"""Parts of an Abaqus file: their nodes, elements and sets, and the places of their instances."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .gather import SOLIDS, Numbering, block
 
 __all__ = ["Part", "Place", "content_of", "fields_of", "read_elements", "read_nodes", "read_set"]
 
-# Solids by the count of their nodes, whatever they compute; flat elements; trusses, as which meshers write edges.
+# Solids by node count, for any physics; flat elements; trusses, which meshers write for edges.
 _SOLID = re.compile(r"(?:(?:A|D|DC|EM)?C3D|Q3D)(4|5|6|8|10|13|15|18|20|27)(?!\d)|(?:SC|CSS)(6|8)")
 _FLAT = re.compile(r"(?:S|DS|M3D|R3D|SFM3D|STRI|CPS|CPE|CPEG|CAX|CGAX|D?C2D|AC2D|DC2D|DCAX|ACAX)([34689])")
 _FLATS = {3: "triangle", 6: "triangle", 4: "quad", 8: "quad", 9: "quad"}
@@ -26,16 +26,16 @@ _TRUSS = re.compile(r"T[23]D([23])")
 
 @dataclass(eq=False)
 class Part:
-    """Nodes, elements and element sets, numbered by the part itself."""
+    """Nodes, elements and element sets of a part, in its own numbering."""
 
     name: str
     numbers: list[Index] = field(default_factory=list)
     points: list[Array] = field(default_factory=list)
     elements: list[tuple[str, Index, Index]] = field(default_factory=list)  # kind, number of each, nodes of each
-    # numbers of elements, ranges of them, and names of other sets
+    # element numbers, ranges of them, and names of other sets
     sets: dict[str, list[Index | range | str]] = field(default_factory=dict)
     written: list[str] = field(default_factory=list)  # sets that *ELEMENT names
-    sections: list[str] = field(default_factory=list)  # sets that a material is given to
+    sections: list[str] = field(default_factory=list)  # sets with a material
 
 
 @dataclass(eq=False)
@@ -46,11 +46,11 @@ class Place:
     part: Part  # a copy: an instance may add nodes and elements of its own
     rotation: Array
     offset: Array
-    source: str = ""  # the name of the part
+    source: str = ""  # name of the part
 
     @classmethod
     def of(cls, name: str, part: Part, lines: list[str]) -> Place:
-        """From the data of *INSTANCE: a translation, then two points on an axis and an angle [degrees]."""
+        """Parse the data of *INSTANCE: a translation, then two points on an axis and an angle [degrees]."""
         rows = [_reals(line) for line in lines]
         if len(rows) > 2 or (rows and len(rows[0]) > 3) or (len(rows) == 2 and len(rows[1]) != 7):
             raise ValueError(f"*INSTANCE {name} must have a translation and an axis with an angle, got {lines[:3]}")
@@ -61,20 +61,20 @@ class Place:
             start, end = rows[1][:3], rows[1][3:6]
             if not np.linalg.norm(end - start) > 0:
                 raise ValueError(f"the axis of *INSTANCE {name} must have two different points")
-            # The axis stands in the assembly, so that the part is moved before it turns.
+            # The axis is in the assembly, so the part is translated before it rotates.
             turn = rotation(end - start, rows[1][6])
             offset = turn @ (offset - start) + start
         return cls(name, deepcopy(part), turn, offset, part.name)
 
 
 def _reals(line: str) -> Array:
-    """The numbers between the commas of a line, of which one that is missing is 0."""
+    """Numbers between the commas of a line; a missing one is 0."""
     fields = [entry.strip() or "0" for entry in line.rstrip(", ").split(",")]
     return np.asarray(parse(" ".join(fields).encode(), np.float64, "data"), dtype=np.float64)
 
 
 def fields_of(line: str) -> list[str]:
-    """What stands between the commas of a line that are not in quotes."""
+    """Fields between the commas of a line outside of quotes."""
     return [field.strip() for field in (_FIELD.findall(line) if '"' in line else line.split(","))]
 
 
@@ -83,7 +83,7 @@ def _whole(text: str, what: str) -> Index:
 
 
 def read_nodes(part: Part, lines: list[str]) -> None:
-    """Rows of number, x, y, z; directions behind them are no part of the mesh."""
+    """Read rows of number, x, y, z; directions after them are skipped."""
     if not lines:
         return
     widths = {line.rstrip(", ").count(",") for line in lines}
@@ -102,7 +102,7 @@ def read_nodes(part: Part, lines: list[str]) -> None:
 
 
 def _kind_of(name: str) -> tuple[str, int | None]:
-    """The kind of a type of elements, and how many nodes it has where that is known."""
+    """Kind of an element type, and its node count if known."""
     for pattern, kinds in ((_SOLID, SOLIDS), (_FLAT, _FLATS)):
         if match := pattern.match(name):
             count = int(next(filter(None, match.groups())))
@@ -113,7 +113,7 @@ def _kind_of(name: str) -> tuple[str, int | None]:
 
 
 def read_elements(part: Part, lines: list[str], options: dict[str, str]) -> None:
-    """Rows of number and nodes, which may go on in the next line."""
+    """Read rows of number and nodes, which may continue in the next line."""
     name = options.get("TYPE", "").upper()
     if not name:
         raise ValueError("*ELEMENT must name a TYPE")
@@ -138,7 +138,7 @@ def read_elements(part: Part, lines: list[str], options: dict[str, str]) -> None
 
 
 def read_set(part: Part, lines: list[str], options: dict[str, str]) -> None:
-    """Numbers of elements, names of other sets or, with GENERATE, rows of first, last and step."""
+    """Read element numbers, names of other sets or, with GENERATE, rows of first, last and step."""
     found = part.sets.setdefault(options.get("ELSET", "").upper(), [])
     for line in lines:
         entries = [entry.strip('"') for entry in fields_of(line) if entry]
@@ -152,7 +152,7 @@ def read_set(part: Part, lines: list[str], options: dict[str, str]) -> None:
 
 
 def _members(part: Part, name: str, above: tuple[str, ...] = ()) -> list[Index]:
-    """Numbers of the elements of a set, also of the sets that it names."""
+    """Element numbers of a set, including those of the sets that it names."""
     everything = np.concatenate([np.empty(0, dtype=np.int64), *(numbers for _, numbers, _ in part.elements)])
     found = [np.empty(0, dtype=np.int64)]
     for entry in part.sets.get(name, []):
@@ -167,7 +167,7 @@ def _members(part: Part, name: str, above: tuple[str, ...] = ()) -> list[Index]:
 
 
 def content_of(parts: list[Part], places: list[Place], notes: list[str]) -> MeshContent:
-    """All parts where their instances stand; without instances, each as it is."""
+    """All parts at the places of their instances; without instances, each part as it is."""
     used = {place.source for place in places}
     lost = [part for part in parts if part.elements and part.name not in used]
     if places:
@@ -210,7 +210,7 @@ def content_of(parts: list[Part], places: list[Place], notes: list[str]) -> Mesh
 
 
 class _Regions:
-    """The region of each element of a part: which of its chosen sets it belongs to, counted on from `first`."""
+    """Region of each element of a part: number of its set among the chosen ones, counted from `first`."""
 
     def __init__(self, part: Part, chosen: list[str], first: int, *, several: bool) -> None:
         self.none = not chosen and not several

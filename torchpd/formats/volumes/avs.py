@@ -15,7 +15,7 @@ from .gather import Numbering, blocks_of, renumbered
 
 __all__ = ["read"]
 
-# Kind, count of corners, and which of them come in the order of VTK.
+# kind, number of corners, and their order in VTK
 _KINDS = {
     "pt": ("vertex", [0]),
     "line": ("line", [0, 1]),
@@ -29,7 +29,7 @@ _KINDS = {
 
 
 def read(path: Path) -> MeshContent:
-    """Read points and cells; data of points and cells behind them are passed over."""
+    """Read points and cells; data of points and cells after them are skipped."""
     lines = lines_of(path, "#")
     head = parse(lines[0].encode() if lines else b"", np.int64, "counts")
     if len(head) < 2:
@@ -37,7 +37,7 @@ def read(path: Path) -> MeshContent:
     count, total = int(head[0]), int(head[1])
     check_room(count, 1, len(lines) - 1, "points, a line each,")
     check_room(total, 1, len(lines) - 1 - count, "cells, a line each,")
-    if not head[2:4].any():  # neither data of points nor of cells
+    if not head[2:4].any():  # neither point data nor cell data
         check_rows(lines[1 + count :], total, "cells")
     table = parse("\n".join(lines[1 : 1 + count]).encode(), np.float64, "points")
     if len(table) != 4 * count:

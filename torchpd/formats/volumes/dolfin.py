@@ -12,7 +12,7 @@ import numpy as np
 
 from ..content import MeshContent
 from ..numbers import xml_of
-from .gather import block, in_space
+from .gather import as_3d, block
 
 __all__ = ["read"]
 
@@ -35,13 +35,13 @@ def read(path: Path) -> MeshContent:
     cells = _table(mesh, "cells", cell, [f"v{k}" for k in range(corners)]).astype(np.int64)
     if len(axes) == 1:
         points = np.column_stack([points, np.zeros(len(points))])
-    return MeshContent(in_space(points), [block(kind, cells)])
+    return MeshContent(as_3d(points), [block(kind, cells)])
 
 
 def _table(
     mesh: ElementTree.Element, group: str, tag: str, names: list[str]
 ) -> np.ndarray[tuple[int, int], np.dtype[np.str_]]:
-    """The attributes of all entries of a group, in the order of their indices."""
+    """Attributes of all entries of a group, in the order of their indices."""
     groups = mesh.findall(group)
     entries = [entry for part in groups for entry in part]
     declared = sum(int(part.get("size", "-1")) for part in groups)

@@ -14,7 +14,7 @@ from .gather import Numbering, blocks_of, renumbered
 
 __all__ = ["read"]
 
-# Kind, and the corners in the order of VTK; B7 is a brick one corner of which comes twice.
+# kind, and the corners in the order of VTK; B7 is a brick with one corner twice
 _KINDS = {
     "T4": ("tetra", [0, 1, 2, 3]),
     "P5": ("pyramid", [0, 1, 4, 2, 3]),
@@ -27,7 +27,7 @@ _KINDS = {
 
 
 def read(path: Path) -> MeshContent:
-    """Read text or, where it holds bytes, what meshio makes of them."""
+    """Read text or, for a binary file, the result of meshio."""
     if b"\0" in path.read_bytes()[:8]:
         return through_meshio.read(path)
     numbers, points, kinds, nodes, zones = list[int](), list[str](), list[str](), list[list[int]](), list[int]()

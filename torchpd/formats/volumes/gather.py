@@ -1,4 +1,4 @@
-"""What readers share: cells by kind, points by number."""
+"""Helpers of the readers: cells by kind, points by number."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ import numpy as np
 
 from ..content import CELLS, Cells, Index
 
-__all__ = ["SOLIDS", "Numbering", "block", "blocks_of", "in_space", "renumbered"]
+__all__ = ["SOLIDS", "Numbering", "as_3d", "block", "blocks_of", "renumbered"]
 
 
-# Kind of a solid by the count of its nodes.
+# kind of a solid by its node count
 SOLIDS = {4: "tetra", 10: "tetra", 5: "pyramid", 13: "pyramid", 6: "wedge", 15: "wedge", 18: "wedge"}
 SOLIDS |= {8: "hexahedron", 20: "hexahedron", 27: "hexahedron"}
 
 
 def renumbered(cells: list[Cells], place: Callable[[Index], Index]) -> list[Cells]:
-    """Cells with the points that stand at `place` of their numbers."""
+    """Cells with point numbers mapped by `place`."""
     return [replace(c, corners=place(c.corners), beyond=None if c.beyond is None else place(c.beyond)) for c in cells]
 
 
-def in_space(points: Any) -> Any:
-    """Points [N, 3]; a third coordinate that is missing is 0."""
+def as_3d(points: Any) -> Any:
+    """Points [N, 3]; a missing third coordinate is 0."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] not in (2, 3):
         raise ValueError(f"points must have two or three coordinates, got an array {list(array.shape)}")
@@ -41,7 +41,7 @@ def block(kind: str, nodes: Index, regions: Index | None = None) -> Cells:
 
 
 def blocks_of(kinds: list[str], rows: Sequence[Sequence[int]], regions: list[int] | None = None) -> list[Cells]:
-    """Blocks of cells that come one by one, each with its kind and its nodes: one block for each kind and length."""
+    """Group single cells, each with its kind and nodes, into one block for each kind and length."""
     groups: dict[tuple[str, int], list[int]] = {}
     for number, (kind, row) in enumerate(zip(kinds, rows, strict=True)):
         groups.setdefault((kind, len(row)), []).append(number)
@@ -57,11 +57,11 @@ def blocks_of(kinds: list[str], rows: Sequence[Sequence[int]], regions: list[int
 
 
 class Numbering:
-    """Turns the numbers that a file gives its points into positions in the file.
+    """Map from the point numbers of a file to positions in the file.
 
     Args:
         numbers: the number of each point, in any order.
-        what: what errors call them.
+        what: name of the points in errors.
     """
 
     def __init__(self, numbers: Index, what: str = "node") -> None:

@@ -1,6 +1,6 @@
 """Gmsh's .msh of the versions 1, 2, 4.0 and 4.1, as text or binary: nodes, elements and physical groups.
 
-Format: https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format. Other sections are passed over.
+Format: https://gmsh.info/doc/texinfo/gmsh.html#MSH-file-format. Other sections are skipped.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ _ENTITIES = ("points", "curves", "surfaces", "volumes")
 
 
 class _File:
-    """What the sections of a file have brought so far."""
+    """Content of the sections read so far."""
 
     def __init__(self) -> None:
-        self.version, self.size, self.order = 1.0, 8, ""  # order: "<" or ">" in binary files
+        self.version, self.size, self.order = 1.0, 8, ""  # byte order of binary files: "<" or ">"
         self.numbers: list[Index] = []
         self.points: list[Array] = []
         self.elements: list[tuple[int, Index, Index, Index]] = []  # type, nodes, physical group, geometric entity
         self.partitions = 0
-        self.parts: dict[tuple[int, int], list[int]] = {}  # the partitions of (dimension, tag) of an entity
-        self.present: set[int] = set()  # the partitions of which elements come
-        self.groups: dict[tuple[int, int], list[int]] = {}  # physical groups of (dimension, tag) of an entity
+        self.parts: dict[tuple[int, int], list[int]] = {}  # partitions of an entity by (dimension, tag)
+        self.present: set[int] = set()  # partitions of the elements
+        self.groups: dict[tuple[int, int], list[int]] = {}  # physical groups of an entity by (dimension, tag)
         self.names: dict[tuple[int, int], str] = {}
         self.notes: list[str] = []
 
 
 def read(path: Path) -> MeshContent:
-    """Read a file of Gmsh, or of Fluent, which has the same suffix."""
+    """Read a file of Gmsh, or of Fluent, which uses the same suffix."""
     data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
     if data.lstrip()[:1] == b"(":
         return through_meshio.read(path)
@@ -65,7 +65,7 @@ def _skip_blanks(data: bytes, at: int) -> int:
 
 
 def _read_section(file: _File, name: str, data: bytes, at: int) -> int:
-    """Read what is needed of a section that begins at `at`: where the next one begins."""
+    """Read a section that begins at `at`; returns the start of the next one."""
     readers = {
         "MeshFormat": _read_format,
         "PhysicalNames": _read_names,
@@ -89,7 +89,7 @@ def _read_section(file: _File, name: str, data: bytes, at: int) -> int:
     if end < 0:
         if name in readers:
             raise ValueError(f"section ${name} has no end: the file was cut off")
-        return len(data)  # data beside the mesh, which nobody needs
+        return len(data)  # data beside the mesh, unused
     rest = data[at:end]
     if name in readers and not binary:
         text = Text(rest)
@@ -126,7 +126,7 @@ def _read_names(file: _File, text: Numbers, name: str) -> None:
 
 
 def _read_entities(file: _File, numbers: Numbers, name: str) -> None:
-    """The physical groups of each entity; with partitions, entities have others as their parents."""
+    """Read the physical groups of each entity; entities of a partition refer to a parent."""
     split = name == "PartitionedEntities"
     if split:
         file.partitions, ghosts = map(int, numbers.sizes(2, "partitions"))
@@ -181,7 +181,7 @@ def _read_nodes(file: _File, numbers: Numbers, name: str) -> None:
 
 
 def _first(numbers: Numbers, count: int, what: str) -> Index:
-    """Counts in front of a section, which are text in binary files of version 2."""
+    """Counts at the head of a section, which are text in binary files of version 2."""
     if isinstance(numbers, Binary):
         text = Text(numbers.data, numbers.at)
         values = parse((text.line() or "").encode("latin-1"), np.int64, what)
@@ -251,7 +251,7 @@ def _read_tagged_blocks(file: _File, numbers: Binary) -> None:
 
 
 def _read_rows(file: _File, text: Numbers) -> None:
-    """Elements as rows of text of different lengths: number, type, count of tags, tags, nodes (version 2)."""
+    """Read elements as text rows of different lengths: number, type, count of tags, tags, nodes (version 2)."""
     assert isinstance(text, Text)
     total = int(text.ints(1, "elements")[0])
     values = parse(text.data[text.at :], np.int64, "elements")
@@ -294,7 +294,7 @@ def _content(file: _File) -> MeshContent:
     solid, cells, repeated = [], [], 0
     for kind, parts in merged.items():
         nodes, physical, entity = (np.concatenate([part[k] for part in parts]) for k in range(3))
-        # Version 2 repeats an element for each physical group that it belongs to.
+        # Version 2 repeats an element for each of its physical groups.
         first = np.sort(np.unique(nodes, axis=0, return_index=True)[1]) if file.version < 4 else np.arange(len(nodes))
         repeated += len(nodes) - len(first)
         cells.append((TYPES[kind][0], place(nodes[first]), physical[first], entity[first]))
@@ -305,7 +305,7 @@ def _content(file: _File) -> MeshContent:
         notes.append(f"only {len(file.present)} of its {file.partitions} partitions come")
     if repeated:
         notes.append(f"{repeated} elements come again, for other physical groups, and were left out")
-    # Without physical groups, the volumes of the geometry are the regions where there are several.
+    # without physical groups, the volumes of the geometry are the regions if there are several
     grouped = any(physical.any() for _, _, physical, _ in (solid or cells))
     entities = np.unique(np.concatenate([entity for *_, entity in solid] or [np.zeros(1, np.int64)]))
     blocks: list[Cells] = []

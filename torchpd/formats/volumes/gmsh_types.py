@@ -29,7 +29,7 @@ _NODES = {
     ("pyramid", 3): {7: 5, 14: 14, 19: 13},
 }
 
-# By its number: kind of the cell, how many nodes it has, corners first, and its dimension.
+# by type number: kind of the cell, its node count (corners first), and its dimension
 TYPES = {
     number: (kind, count, dimension) for (kind, dimension), counts in _NODES.items() for number, count in counts.items()
 }

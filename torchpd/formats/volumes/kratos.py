@@ -1,4 +1,4 @@
-"""Kratos' .mdpa: nodes, elements, conditions and geometries; the number of the properties is the region.
+"""Kratos' .mdpa: nodes, elements, conditions and geometries; the property number is the region.
 
 Format: https://github.com/KratosMultiphysics/Kratos/wiki/Input-data.
 """
@@ -26,7 +26,7 @@ _SHAPES = {
     "line": "line",
     "point": "vertex",
 }
-# Where the name tells no shape, dimension and count of nodes do.
+# shape by dimension and node count, for names without a shape
 _FLATS = {1: "vertex", 2: "line", 3: "triangle", 6: "triangle", 4: "quad", 8: "quad", 9: "quad"}
 
 

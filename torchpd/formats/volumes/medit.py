@@ -1,6 +1,6 @@
 """Medit's .mesh and .meshb: vertices, cells and their references.
 
-Format: https://github.com/LoicMarechal/libMeshb. Other fields are passed over.
+Format: https://github.com/LoicMarechal/libMeshb. Other fields are skipped.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 
 from ..content import Array, Cells, MeshContent
 from ..numbers import Binary, Text, text_of
-from .gather import block, in_space
+from .gather import as_3d, block
 
 __all__ = ["read"]
 
-# Kind of the cells of a field and the nodes of each, by its name in text: of order 1, and of orders 2 to 4.
+# kind and node count of the cells of a field, by its name in text: order 1, and orders 2 to 4
 _NODES = {
     "edges": ("line", "p", (2, 3, 4, 5)),
     "triangles": ("triangle", "p", (3, 6, 10, 15)),
@@ -25,14 +25,14 @@ _NODES = {
     "pyramids": ("pyramid", "p", (5, 14, 30, 55)),
     "prisms": ("wedge", "p", (6, 18, 40, 75)),
     "hexahedra": ("hexahedron", "q", (8, 27, 64, 125)),
-    "hexaedra": ("hexahedron", "q", (8, 27, 64, 125)),  # as some write it
+    "hexaedra": ("hexahedron", "q", (8, 27, 64, 125)),  # spelling of some writers
 }
 _CELLS = {
     name + (f"{letter}{order}" if order > 1 else ""): (kind, count)
     for name, (kind, letter, counts) in _NODES.items()
     for order, count in enumerate(counts, start=1)
 }
-# Numbers of these fields in binary files.
+# numbers of these fields in binary files
 _CODES = {5: "edges", 6: "triangles", 7: "quadrilaterals", 8: "tetrahedra", 9: "prisms", 10: "hexahedra"}
 _CODES |= {49: "pyramids", 24: "trianglesp2", 25: "edgesp2", 30: "tetrahedrap2", 33: "hexahedraq2"}
 _CODES |= {27: "quadrilateralsq2", 86: "prismsp2", 87: "pyramidsp2"}
@@ -45,7 +45,7 @@ def read(path: Path) -> MeshContent:
     points, cells, ended = _read_binary(path.read_bytes()) if binary else _read_text(path)
     if points is None:
         raise ValueError("it has no Vertices")
-    return MeshContent(in_space(points), cells, notes=[] if ended else ["no End comes: was the file cut off?"])
+    return MeshContent(as_3d(points), cells, notes=[] if ended else ["no End comes: was the file cut off?"])
 
 
 def _read_text(path: Path) -> tuple[Array | None, list[Cells], bool]:
@@ -74,7 +74,7 @@ def _read_text(path: Path) -> tuple[Array | None, list[Cells], bool]:
 
 
 def _rows(numbers: Text, width: int, key: str) -> Array:
-    """As many rows as the first number says, and nothing behind them."""
+    """As many rows as the leading count says, and nothing after them."""
     count = int(numbers.ints(1, key)[0])
     rows = numbers.floats(width * count, key).reshape(count, width)
     if more := numbers.left():
@@ -111,7 +111,7 @@ def _read_binary(data: bytes) -> tuple[Array | None, list[Cells], bool]:
             count = int(numbers.ints(1, kind)[0])
             rows = numbers.ints(count * (nodes + 1), kind).reshape(count, nodes + 1)
             cells.append(block(kind, rows[:, :nodes] - 1, rows[:, nodes]))
-        if following == 0:  # the last field, as after which some write no end
+        if following == 0:  # last field, after which some files have no end
             return points, cells, True
         if not begin <= following <= len(data):
             raise ValueError(f"a field should end at byte {following}, beyond the {len(data)} bytes of the file")

@@ -1,6 +1,6 @@
 """Nastran's bulk data: GRID and the solid and flat elements, in free, small and large fields.
 
-Format: NX Nastran Quick Reference Guide. The number of the property (PID) is the region.
+Format: NX Nastran Quick Reference Guide. The property number (PID) is the region.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .gather import Numbering, blocks_of
 
 __all__ = ["read"]
 
-# Kind of an element, and the most nodes that it has; other fields follow flat ones.
+# kind of an element, and its largest number of nodes; other fields follow those of flat ones
 _KINDS = {
     "CTETRA": ("tetra", 10),
     "CPYRAM": ("pyramid", 13),
@@ -34,14 +34,14 @@ _KINDS = {
     "CQUADR": ("quad", 4),
     "CSHEAR": ("quad", 4),
 }
-# Elements of other shapes: they have no volume, but hold the body, so that they are named.
+# structural elements without a volume, which the notes name
 _OTHERS = re.compile(
     r"C(BAR|BEAM|BEAM3|BEND|ROD|TUBE|BUSH|BUSH1D|GAP|ELAS\d|DAMP\d|MASS\d|VISC|WELD|FAST|ONROD|ONM\d)$"
 )
 
 
 def read(path: Path) -> MeshContent:
-    """Read points and elements; coordinates in a system of their own are refused."""
+    """Read points and elements; local coordinate systems are refused."""
     numbers, points, kinds, nodes, regions = [], [], list[str](), list[list[int]](), list[int]()
     others: dict[str, int] = {}
     for card, fields in _cards(text_of(path)):
@@ -77,7 +77,7 @@ def read(path: Path) -> MeshContent:
 
 
 def _cards(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Each card with its fields, at least nine, those of the lines that continue it too."""
+    """Cards with their fields, at least nine, including those of continuation lines."""
     lines = [line.split("$")[0].rstrip().expandtabs(8) for line in text.split("\n")]
     begin = [n for n, line in enumerate(lines) if re.match(r"\s*BEGIN\s+(BULK|SUPER)", line.upper())]
     if len(begin) > 1:
@@ -102,7 +102,7 @@ def _cards(text: str) -> Iterator[tuple[str, list[str]]]:
 
 
 def _fields(line: str) -> tuple[str, list[str]]:
-    """The first field of a line, and its eight fields of data, or four of double width."""
+    """First field of a line, and its eight data fields, or four of double width."""
     if "," in line:
         first, *rest = (field.strip() for field in line.split(","))
         count = 4 if first.endswith("*") else 8
@@ -122,7 +122,7 @@ def _whole(field: str, card: str) -> int:
 
 
 def _real(field: str) -> float:
-    """A real number; exponents may come without a letter, as in 1.5-3, or with that of Fortran."""
+    """Parse a real number; an exponent may have no letter, as in 1.5-3, or that of Fortran."""
     match = re.fullmatch(r"([-+]?(?:\d+\.?\d*|\.\d+))(?:[eEdD]?([-+]\d+)|[eEdD](\d+))?", field.strip() or "0")
     if match is None:
         raise ValueError(f"GRID must hold real numbers, got {field[:40]!r}")

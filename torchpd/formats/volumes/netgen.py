@@ -11,11 +11,11 @@ import numpy as np
 
 from ..content import MeshContent
 from ..numbers import check_rows, lines_of, parse
-from .gather import blocks_of, in_space
+from .gather import as_3d, blocks_of
 
 __all__ = ["read"]
 
-# Kind of an element by the count of its nodes, and its corners in the order of VTK.
+# kind of an element by its node count, and its corners in the order of VTK
 _SOLIDS = {
     4: ("tetra", [0, 2, 1, 3]),
     5: ("pyramid", [0, 3, 2, 1, 4]),
@@ -63,11 +63,11 @@ def read(path: Path) -> MeshContent:
             regions.append(numbers[region])
     names = [" is ".join(row.split(None, 1)) for row in sections.get("materials", [])[1:]]
     notes = [f"regions keep their numbers, not their names: {', '.join(names)}"] if names else []
-    return MeshContent(in_space(points), blocks_of(kinds, nodes, regions), notes=notes)
+    return MeshContent(as_3d(points), blocks_of(kinds, nodes, regions), notes=notes)
 
 
 def _declared(rows: list[str], what: str) -> list[str]:
-    """The rows behind their count."""
+    """Rows after their count."""
     count = int(parse(rows[0].encode() if rows else b"x", np.int64, f"the count of {what}")[0])
     check_rows(rows[1:], count, what)
     return rows[1:]

@@ -1,4 +1,4 @@
-"""Permas' .dato and .post: nodes, elements, and the set that an element block names as its region."""
+"""Permas' .dato and .post: nodes, elements, and the set of an element block as its region."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .gather import Numbering, blocks_of, renumbered
 
 __all__ = ["read"]
 
-# Kind and count of nodes of each type, and which of them are the corners: nodes on edges stand between these.
+# kind and node count of each type, and its corners: edge nodes stand between them
 _SOLIDS = {
     "TET4": ("tetra", 4, [0, 1, 2, 3]),
     "TET10": ("tetra", 10, [0, 2, 4, 9]),
@@ -33,7 +33,7 @@ _FLAT = re.compile(r"(?:TRIA|TRIMS|SHELL|PLOTA|LOADA|QUAD|QUAMS)([3469])")
 
 
 def read(path: Path) -> MeshContent:
-    """Read one component; elements of types whose order of nodes is not known are refused."""
+    """Read one component; types with an unknown node order are refused."""
     sections: list[tuple[list[str], list[str]]] = []
     for line in lines_of(path, "!"):
         if line.startswith("$"):
@@ -73,7 +73,7 @@ def read(path: Path) -> MeshContent:
 
 
 def _table(rows: list[str], width: int, what: str) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """Rows of so many numbers, which & joins across lines."""
+    """Rows of `width` numbers, which & joins across lines."""
     values = parse(" ".join(rows).replace("&", " ").encode(), np.float64, what)
     if len(values) % width:
         raise ValueError(f"{what} must have {width} numbers each, but {len(values)} come")

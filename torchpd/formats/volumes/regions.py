@@ -1,4 +1,4 @@
-"""Which array of the cells of a file holds their regions."""
+"""Choice of the cell array that holds the regions of a file."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["choose", "may_be"]
+__all__ = ["can_hold_regions", "choose_regions"]
 
-# Names that are known to be those of regions, in lower case, the best first.
+# usual names of region arrays, in lower case, the best first
 _KNOWN = [
     *("gmsh:physical", "medit:ref", "materialids", "material_ids", "materialid", "material", "region", "regions"),
     *("regionid", "region_id", "physicalids", "physical", "cellentityids", "elementblockids", "label", "labels"),
@@ -17,8 +17,8 @@ _KNOWN = [
 ]
 
 
-def may_be(name: str, values: Any) -> bool:
-    """Whether an array holds a whole number for each cell: integers or, under a name that is known, reals."""
+def can_hold_regions(name: str, values: Any) -> bool:
+    """Whether an array holds a whole number per cell: integers, or reals under a usual name."""
     array = np.asarray(values)
     if array.size != len(array) or array.dtype.kind not in "iuf":
         return False
@@ -26,18 +26,18 @@ def may_be(name: str, values: Any) -> bool:
     return not real or (name.lower() in _KNOWN and bool(((array == np.rint(array)) & (np.abs(array) < 2.0**53)).all()))
 
 
-def choose(names: Iterable[str], notes: list[str]) -> str | None:
-    """Choose among the arrays that may be: one whose name is known, or else the only one; None where neither is.
+def choose_regions(names: Iterable[str], notes: list[str]) -> str | None:
+    """Name of the region array among the candidates: one with a usual name, or else the only one; None otherwise.
 
-    What was chosen by another name, or not chosen, is added to the notes.
+    A choice without a usual name, or no choice, is added to the notes.
     """
     found = sorted(names)
     known = [name for wanted in _KNOWN for name in found if name.lower() == wanted]
     if known:
         return known[0]
     if len(found) == 1:
-        notes.append(f"regions are the array {found[0]!r}, the only one of the cells that holds integers")
+        notes.append(f"regions are the array {found[0]!r}, the only integer array of the cells")
         return found[0]
     if found:
-        notes.append(f"no regions: several arrays of cells hold integers ({', '.join(found)})")
+        notes.append(f"no regions: several cell arrays hold integers ({', '.join(found)})")
     return None

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..content import MeshContent
 from ..numbers import check_room, lines_of, parse
-from .gather import blocks_of, in_space
+from .gather import as_3d, blocks_of
 
 __all__ = ["read"]
 
@@ -27,7 +27,7 @@ _KINDS = {
 
 
 def read(path: Path) -> MeshContent:
-    """Read one zone; a file of several is refused."""
+    """Read one zone; a file with several is refused."""
     lines = lines_of(path, "%")
     dimension, points, kinds, nodes = 3, None, list[str](), list[list[int]]()
     at, declared, markers = 0, 0, 0
@@ -65,7 +65,7 @@ def read(path: Path) -> MeshContent:
         raise ValueError(f"it declares {declared} markers, but {markers} come")
     if points is None:
         raise ValueError("it has no NPOIN")
-    return MeshContent(in_space(points), blocks_of(kinds, nodes))
+    return MeshContent(as_3d(points), blocks_of(kinds, nodes))
 
 
 def _rows(lines: list[str], at: int, count: int, what: str) -> list[str]:

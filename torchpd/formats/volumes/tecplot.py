@@ -30,21 +30,21 @@ _REGIONS = ("gmsh:physical", "medit:ref", "region", "regions", "material")
 
 @dataclass(eq=False)
 class _Zone:
-    """What the head of a zone declares."""
+    """Declarations in the head of a zone."""
 
     kind: str
     corners: int
     nodes: int
     cells: int
     packed: bool  # one variable after another
-    centred: set[int]  # variables of the cells
+    centred: set[int]  # cell variables
 
 
 def read(path: Path) -> MeshContent:
-    """Read all zones; ordered zones, and zones that share what others hold, are refused."""
+    """Read all zones; ordered zones, and zones that share data with others, are refused."""
     text = text_of(path)
     text = re.sub(r"(?m)^\s*#[^\n]*", "", text)
-    # heads begin with a letter or a quote at the start of a line, data with a digit, a sign or a point
+    # a head line begins with a letter or a quote, a data line with a digit, a sign or a point
     parts = re.split(r"(?im)^\s*(?=zone\b)", text)
     names = _variables(parts[0])
     lowered = [name.lower() for name in names]
@@ -73,7 +73,7 @@ def _variables(head: str) -> list[str]:
 
 
 def _read_zone(part: str, count: int, axes: list[int], marked: int | None) -> tuple[Array, Cells]:
-    """Points and cells of a zone."""
+    """Read points and cells of a zone."""
     lines = part.split("\n")
     end = next((n for n, line in enumerate(lines) if n and re.match(r"\s*[-+.\d]", line)), len(lines))
     zone = _head(" ".join(lines[:end]), count)
@@ -107,7 +107,7 @@ def _read_zone(part: str, count: int, axes: list[int], marked: int | None) -> tu
 
 
 def _expand(numbers: Text) -> None:
-    """Write out repeated numbers, as in 3*1.5."""
+    """Expand repeated numbers, as in 3*1.5."""
     if b"*" in numbers.data:
         limit = 64 * len(numbers.data) + 1024
         size = sum(int(n) for n in re.findall(rb"(\d+)\*", numbers.data))
@@ -118,7 +118,7 @@ def _expand(numbers: Text) -> None:
 
 
 def _head(text: str, count: int) -> _Zone:
-    """What follows the word ZONE."""
+    """Parse the text after the word ZONE."""
     words = [word for word in _WORD.findall(text)[1:] if word != ","]
     pairs = {words[n - 1].upper(): words[n + 1].strip("\"'") for n in range(1, len(words) - 1) if words[n] == "="}
     for key in ("VARSHARELIST", "CONNECTIVITYSHAREZONE", "D", "PASSIVEVARLIST", "PARENTZONE"):

@@ -46,7 +46,7 @@ def read(path: Path) -> MeshContent:
 
 
 def _table(path: Path, what: str) -> tuple[list[int], Array]:
-    """The numbers of the first line, and those behind it in as many rows as the first of them says."""
+    """Numbers of the first line, and the following rows, whose count is the first of these numbers."""
     lines = lines_of(path, "#")
     head = lines[0].split() if lines else []
     if not head or not all(word.isdigit() for word in head):
@@ -63,7 +63,7 @@ def _table(path: Path, what: str) -> tuple[list[int], Array]:
 
 
 def _whole(values: Array, notes: list[str]) -> Index:
-    """Numbers that should be integers, as such."""
+    """Convert numbers to integers, with a note if they are not whole."""
     numbers = np.rint(values)
     if (numbers != values).any():
         notes.append("attributes of tets are no whole numbers, and were rounded to those of regions")

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..content import CELLS, Cells, Index, MeshContent
-from .gather import block, in_space
-from .regions import choose, may_be
+from .gather import as_3d, block
+from .regions import can_hold_regions, choose_regions
 
 __all__ = ["NAMES", "read"]
 
@@ -28,7 +28,7 @@ NAMES = {
 }
 
 
-# Formats whose blocks of elements are what others call regions.
+# formats whose element blocks are the regions
 _BLOCKS = {".e", ".ex2", ".exo"}
 _TETRA_4 = 10  # CGNS
 
@@ -45,24 +45,24 @@ def read(path: Path) -> MeshContent:
 
 
 def _read_fluent(path: Path) -> MeshContent:
-    """Read a .msh of Fluent's, in which cells must list their corners."""
+    """Read a Fluent .msh, whose cells must list their corners."""
     import meshio
 
     data = path.read_bytes()
     if re.search(rb"\(\s*(20|30)?13\s*\(", data):
         raise ValueError("it is a mesh of Fluent, which lists faces, not corners of cells; write it as .vtu")
     with path.open("rb", buffering=0) as raw:
-        content = content_of(meshio.read(_Ending(raw), file_format="ansys"))
+        content = content_of(meshio.read(_EndGuard(raw), file_format="ansys"))
     head = re.search(rb"\(\s*12\s*\(\s*0\s+1\s+([0-9a-fA-F]+)", data)
     came = sum(map(len, content.cells))
     if head is None or int(head.group(1), 16) != came:
-        told = "no number of cells" if head is None else f"{int(head.group(1), 16)} cells"
-        raise ValueError(f"it is a mesh of Fluent that declares {told}, but {came} come")
+        listed = "no number of cells" if head is None else f"{int(head.group(1), 16)} cells"
+        raise ValueError(f"it is a mesh of Fluent that declares {listed}, but {came} come")
     return content
 
 
 def _check_sections(path: Path) -> None:
-    """Refuse files with more than the one section of cells, of one kind in an .hmf, that meshio reads."""
+    """Refuse files with sections that meshio would not read: it reads one of cells, of one kind in an .hmf."""
     import h5py
 
     found: list[str] = []
@@ -81,8 +81,8 @@ def _check_sections(path: Path) -> None:
             raise ValueError(f"it holds {count} times a {name}, of which one would be read; write them one by one")
 
 
-class _Ending(io.BufferedReader):
-    """A file that says when a reader goes on behind its end, where meshio's wait for a bracket that never comes."""
+class _EndGuard(io.BufferedReader):
+    """File that raises at its end, where meshio's readers would wait for a bracket forever."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         data = super().read(size)
@@ -92,10 +92,10 @@ class _Ending(io.BufferedReader):
 
 
 def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
-    """Points, cells and regions of a `meshio.Mesh`; blocks of cells are regions where there are no others."""
+    """Points, cells and regions of a `meshio.Mesh`; cell blocks are the regions if there are no others."""
     notes: list[str] = []
-    chosen = choose(
-        (name for name, parts in mesh.cell_data.items() if all(may_be(name, part) for part in parts)), notes
+    chosen = choose_regions(
+        (name for name, parts in mesh.cell_data.items() if all(can_hold_regions(name, part) for part in parts)), notes
     )
     cells = []
     for number, part in enumerate(mesh.cells):
@@ -111,9 +111,9 @@ def content_of(mesh: Any, *, by_block: bool = False) -> MeshContent:
         notes.append("regions are the blocks of elements, counted from 1")
     names = getattr(mesh, "cell_tags", None)  # of MED
     if chosen == "cell_tags" and names:
-        told = ", ".join(f"{number} is {' and '.join(map(str, groups))}" for number, groups in names.items())
-        notes.append(f"regions keep their numbers, not their names: {told}")
-    return MeshContent(in_space(mesh.points), cells, notes=notes)
+        listed = ", ".join(f"{number} is {' and '.join(map(str, groups))}" for number, groups in names.items())
+        notes.append(f"regions keep their numbers, not their names: {listed}")
+    return MeshContent(as_3d(mesh.points), cells, notes=notes)
 
 
 def _cells(kind: str, nodes: Any, regions: Index | None) -> Cells:

@@ -15,7 +15,7 @@ from .gather import block
 
 __all__ = ["read"]
 
-# Order of bytes, real numbers, integers, and whether records of Fortran stand around them.
+# byte order, real type, integer type, and whether Fortran records enclose them
 _BINARY = {
     "b8l": (">", "f8", "i8", False),
     "b8": (">", "f8", "i4", False),
@@ -51,7 +51,7 @@ def read(path: Path) -> MeshContent:
         rows = numbers.ints(corners * counts[kind], kind).reshape(-1, corners) - 1
         if kind == "quad":
             numbers.ints(counts["triangle"] + counts["quad"], "marks of faces")
-        # its third corner is the tip of a pyramid
+        # the third corner is the apex of a pyramid
         cells.append(block(kind, rows[:, [1, 0, 3, 4, 2]] if kind == "pyramid" else rows))
     left = numbers.left() - 4 * records
     notes = [f"{left} {'bytes' if form else 'numbers'} behind its cells left out"] if left > 0 else []

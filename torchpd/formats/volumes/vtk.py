@@ -34,7 +34,7 @@ _TYPES = {
     "float": "f4",
     "double": "f8",
 }
-# Cells of polygonal data: the type of a row, and of a row of one or two nodes.
+# cells of polygonal data: type of a row, and of a row of one or two nodes
 _POLYS = {"VERTICES": (2, {1: 1}), "LINES": (4, {2: 3}), "POLYGONS": (7, {3: 5, 4: 9}), "TRIANGLE_STRIPS": (6, {})}
 
 
@@ -58,7 +58,7 @@ class _Legacy:
         self.data: dict[str, NDArray[Any]] = {}
 
     def values(self, count: int, kind: str, what: str) -> NDArray[Any]:
-        """The next numbers of a type that the file names."""
+        """Read the next numbers of a type that the file names."""
         if kind.lower() not in _TYPES:
             raise ValueError(f"{what} must be of a type of VTK, got {kind[:40]!r}")
         dtype = np.dtype(">" + _TYPES[kind.lower()])
@@ -101,7 +101,7 @@ def read(path: Path) -> MeshContent:
 
 
 def _read_sections(file: _Legacy) -> list[str]:
-    """Read all sections; what goes wrong in data beside the mesh is said, and ends the reading."""
+    """Read all sections; an error in data beside the mesh is noted and ends the reading."""
     target: dict[str, NDArray[Any]] | None = None
     while (row := file.text.row()) is not None:
         fields = row.split()
@@ -154,7 +154,7 @@ def _read_mesh(file: _Legacy, key: str, fields: list[str]) -> None:
 
 
 def _read_rows(file: _Legacy, fields: list[str]) -> tuple[Index, Index]:
-    """Nodes of all cells, and how many each has: rows that begin with their length or, since 5.1, offsets."""
+    """Nodes of all cells and node count of each: rows with a leading length or, since version 5.1, offsets."""
     key = fields[0].upper()
     count, size = _whole(fields, 1, key), _whole(fields, 2, key)
     start = file.text.at
@@ -186,7 +186,7 @@ def _read_rows(file: _Legacy, fields: list[str]) -> tuple[Index, Index]:
 
 
 def _skip_metadata(file: _Legacy) -> None:
-    """Metadata end with a blank line."""
+    """Skip metadata, which end with a blank line."""
     while file.text.line():
         pass
 
@@ -211,7 +211,7 @@ def _read_field(file: _Legacy, count: int, target: dict[str, NDArray[Any]]) -> N
 
 
 def _read_array(file: _Legacy, key: str, fields: list[str], count: int, target: dict[str, NDArray[Any]]) -> None:
-    """One array of points or cells."""
+    """Read one array of points or cells."""
     widths = {"VECTORS": 3, "NORMALS": 3, "TENSORS": 9, "TENSORS6": 6, "GLOBAL_IDS": 1, "PEDIGREE_IDS": 1}
     if key == "FIELD":
         _read_field(file, _whole(fields, 2, key), target)

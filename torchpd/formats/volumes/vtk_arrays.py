@@ -32,7 +32,7 @@ _TYPES = {
 
 
 class Document:
-    """An XML file of VTK: its tree, and the arrays in it."""
+    """A VTK XML file: its element tree and its arrays."""
 
     def __init__(self, data: bytes) -> None:
         self.appended, self.encoding = b"", "raw"
@@ -63,7 +63,7 @@ class Document:
         return np.dtype(self.order + _TYPES[name.lower()])
 
     def array(self, element: ElementTree.Element) -> NDArray[Any]:
-        """The numbers of a DataArray, [tuples, components] where there are several components."""
+        """Values of a DataArray, [tuples, components] for several components."""
         name = element.get("Name", "points")
         dtype = self._dtype(element.get("type", ""))
         form = element.get("format", "ascii")
@@ -90,7 +90,7 @@ class Document:
         return _decode(self.appended[offset : next(end for end in self.offsets if end > offset)])
 
     def _numbers(self, data: bytes | memoryview, dtype: Any, name: str) -> NDArray[Any]:
-        """Numbers behind their header: the count of bytes, or the sizes of compressed blocks."""
+        """Decode values after their header: the byte count, or the sizes of compressed blocks."""
         size = self.header.itemsize
         if not data and not self.compressor:
             return np.empty(0, dtype=dtype)
@@ -124,7 +124,7 @@ class Document:
 
 
 def _decode(text: bytes) -> bytes:
-    """Base64 of one or more parts, each with its own padding."""
+    """Decode base64 of one or more parts, each with its own padding."""
     letters = b"".join(text.split())
     parts = re.findall(rb"[A-Za-z0-9+/]+={0,2}", letters)
     if sum(map(len, parts)) != len(letters):
@@ -139,7 +139,7 @@ def _unpack(compressor: str, data: bytes | memoryview, expected: int) -> bytes:
         if compressor == "vtkLZMADataCompressor":
             return lzma.LZMADecompressor().decompress(data, expected + 1)
         if compressor == "vtkLZ4DataCompressor":
-            check_room(expected, 1, 256 * len(data), "bytes of a block")  # LZ4 makes no more of a byte
+            check_room(expected, 1, 256 * len(data), "bytes of a block")  # LZ4 expands a byte by this factor at most
             return bytes(import_module("lz4.block").decompress(data, uncompressed_size=expected))
     except (zlib.error, lzma.LZMAError) as error:
         raise ValueError(f"a compressed block is damaged: {error}") from None

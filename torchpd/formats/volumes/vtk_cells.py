@@ -1,4 +1,4 @@
-"""Cells of VTK's data model, from legacy and XML files: types, connectivity, and the array that names regions."""
+"""Cells of VTK's data model, from legacy and XML files: types, connectivity, and the region array."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ..content import CELLS, Array, Cells, Index, MeshContent
 from .gather import block, renumbered
-from .regions import choose, may_be
+from .regions import can_hold_regions, choose_regions
 
 __all__ = ["Piece", "content_of", "offsets_of"]
 
-# https://vtk.org/doc/nightly/html/vtkCellType_8h_source.html: the kind of each type, corners first in all of them.
+# Kind of each type, all with corners first: https://vtk.org/doc/nightly/html/vtkCellType_8h_source.html.
 _KINDS: dict[int, str] = {
     0: "empty cell",
     1: "vertex",
@@ -36,23 +36,23 @@ _KINDS: dict[int, str] = {
     42: "polyhedron",
     63: "polygon of higher order",
 }
-_PIXELS = {8: [0, 1, 3, 2], 11: [0, 1, 3, 2, 4, 5, 7, 6]}  # corners that count along the axes
+_PIXELS = {8: [0, 1, 3, 2], 11: [0, 1, 3, 2, 4, 5, 7, 6]}  # corners in the order of the axes
 _STRIP = 6
 
 
 @dataclass(eq=False)
 class Piece:
-    """One piece of a file: points [N, 3], cells by type [n], nodes one after another, and arrays of the cells."""
+    """One piece of a file: points [N, 3], cell types [n], concatenated nodes, and cell arrays."""
 
     points: Array
     types: Index
     nodes: Index
-    starts: Index  # [n + 1] where the nodes of each cell begin
+    starts: Index  # start of the nodes of each cell [n + 1]
     data: dict[str, NDArray[Any]] = field(default_factory=dict)
 
 
 def offsets_of(ends: Index, nodes: Index, what: str) -> Index:
-    """Where the nodes of each cell begin [n + 1], from where they end [n]."""
+    """Start of the nodes of each cell [n + 1], from their ends [n]."""
     starts = np.concatenate([np.zeros(1, dtype=np.int64), ends])
     if (np.diff(starts) < 0).any() or starts[-1] != len(nodes):
         raise ValueError(f"offsets of {what} must rise to {len(nodes)}, the count of their nodes, got {starts[-1]}")
@@ -60,7 +60,7 @@ def offsets_of(ends: Index, nodes: Index, what: str) -> Index:
 
 
 def content_of(pieces: list[Piece]) -> MeshContent:
-    """One mesh of all pieces; points of different pieces stay apart."""
+    """One mesh of all pieces."""
     notes: list[str] = []
     regions = _regions(pieces, notes)
     cells, first = [], 0
@@ -80,10 +80,10 @@ def content_of(pieces: list[Piece]) -> MeshContent:
 
 
 def _joined(points: Array, owners: Index, notes: list[str]) -> tuple[Array, Index]:
-    """Points without those that another piece has at the same place, and the new number of each.
+    """Merge points that several pieces have at the same place; returns the points and the new number of each.
 
-    Writers in parallel cut a mesh into pieces, each with the points on the cut. Where one piece has two points at a
-    place, they are different ones, and stay.
+    Parallel writers cut a mesh into pieces, each with the points on the cut. If one piece has two points at a place,
+    they are different and stay.
     """
     _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
@@ -119,7 +119,7 @@ def _blocks(piece: Piece, marks: Index | None, first: int) -> list[Cells]:
 
 
 def _unroll(nodes: Index, marks: Index | None) -> Cells:
-    """Triangles of strips of one length; every second one runs the other way round."""
+    """Triangles of strips of one length; every second one has the opposite winding."""
     count = max(nodes.shape[1] - 2, 0)
     rows: Index = np.arange(count)[:, None] + np.arange(3)
     rows[1::2] = rows[1::2, [1, 0, 2]]
@@ -127,13 +127,15 @@ def _unroll(nodes: Index, marks: Index | None) -> Cells:
 
 
 def _regions(pieces: list[Piece], notes: list[str]) -> list[Index | None]:
-    """The region numbers of the cells of each piece: the array with a name for such, or the only one of integers."""
+    """Region numbers of the cells of each piece, from an array with a usual name, or the only integer array."""
     arrays: dict[str, list[NDArray[Any]]] = {}
     for piece in pieces:
         for name, values in piece.data.items():
             if not name.lower().startswith("vtk") and len(values) == len(piece.types):
                 arrays.setdefault(name, []).append(values)
-    chosen = choose((name for name, parts in arrays.items() if all(may_be(name, part) for part in parts)), notes)
+    chosen = choose_regions(
+        (name for name, parts in arrays.items() if all(can_hold_regions(name, part) for part in parts)), notes
+    )
     if chosen is None:
         return [None for _ in pieces]
     return [

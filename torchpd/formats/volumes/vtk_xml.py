@@ -1,4 +1,4 @@
-"""VTK's XML files: .vtu and .vtp with all of their pieces, and .pvtu and .pvtp, which name files of pieces.
+"""VTK's XML files: .vtu and .vtp with all of their pieces, and .pvtu and .pvtp, which refer to files of pieces.
 
 Format: https://docs.vtk.org/en/latest/design_documents/VTKFileFormats.html.
 """
@@ -18,7 +18,7 @@ from .vtk_cells import Piece, content_of, offsets_of
 
 __all__ = ["read"]
 
-# Sections of polygonal data: attribute of their count, type of a cell, and of one with few nodes.
+# sections of polygonal data: attribute of their count, cell type, and cell type by small node count
 _POLYS = {
     "Verts": ("NumberOfVerts", 2, {1: 1}),
     "Lines": ("NumberOfLines", 4, {2: 3}),
@@ -106,7 +106,7 @@ def _points(document: Document, element: Element) -> Array:
 def _cells(
     document: Document, section: Element, count: int, kinds: tuple[int, dict[int, int]] | None
 ) -> tuple[Index, Index, Index]:
-    """Types, nodes one after another, and sizes of the cells of a section."""
+    """Types, concatenated nodes, and sizes of the cells of a section."""
     arrays = {array.get("Name", ""): array for array in section.iter("DataArray")}
     needed = ("connectivity", "offsets") if kinds else ("connectivity", "offsets", "types")
     missing = [name for name in needed if name not in arrays]
@@ -134,7 +134,7 @@ def _whole(values: NDArray[Any], name: str) -> Index:
 
 
 def _without(piece: Piece, ghosts: NDArray[np.bool_], notes: list[str]) -> Piece:
-    """A piece without the cells that another piece has too."""
+    """Copy of a piece without ghost cells, which another piece has too."""
     notes.append(f"{int(ghosts.sum())} ghost cells, which belong to other pieces, were left out")
     sizes = np.diff(piece.starts)
     data = {name: values[~ghosts] for name, values in piece.data.items() if len(values) == len(ghosts)}
