@@ -16,7 +16,7 @@ from machine import judge_scenes
 from tune import random_scene, random_state
 
 import torchpd as pd
-from torchpd.accuracy import ExactStep, exact_steps, frictionless
+from torchpd.accuracy.error import ExactStep, exact_steps, frictionless
 from torchpd.estimate.convergence import forecast, spectrum_of
 from torchpd.estimate.solver_choice import AIM
 

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from tune import random_mesh
 
 import torchpd as pd
-from torchpd.accuracy import Errors, ExactStep, exact_steps
+from torchpd.accuracy.error import Errors, ExactStep, exact_steps
 from torchpd.estimate.convergence import forecast, is_uneven
 from torchpd.estimate.solver_choice import AIM, MARGIN
 from torchpd.geometry.mesh_quality import smallest_dihedral

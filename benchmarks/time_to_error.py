@@ -30,7 +30,7 @@ from machine import describe_run, earlier_rows, run_of, wait_for, write_result
 from tqdm.auto import tqdm
 
 import torchpd as pd
-from torchpd.accuracy import problem_of
+from torchpd.accuracy.error import problem_of
 from torchpd.estimate.convergence import forecast
 from torchpd.estimate.solver_choice import CPU_CHEBYSHEV, Cost, multilevel_cost
 from torchpd.scene.solvers import Solver

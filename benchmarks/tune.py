@@ -24,7 +24,7 @@ from scipy.spatial import Delaunay
 from tqdm.auto import tqdm
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps, settled_steps
+from torchpd.accuracy.error import exact_steps, settled_steps
 from torchpd.accuracy.tuning import TuningWarning
 from torchpd.estimate.convergence import has_friction
 

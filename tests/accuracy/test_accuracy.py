@@ -11,7 +11,7 @@ from runs import full_scene, moving, simulate, simulator, state_of
 
 import torchpd as pd
 from torchpd.accuracy import error as accuracy
-from torchpd.accuracy import (
+from torchpd.accuracy.error import (
     exact_steps,
     frictionless,
     problem_of,

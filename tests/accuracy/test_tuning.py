@@ -10,8 +10,9 @@ import torch
 from tuning_cases import CANDIDATES, bar, swinging, worst_error
 
 import torchpd as pd
-from torchpd.accuracy import ExactStep, exact_steps, settled_steps, tuning
+from torchpd.accuracy import tuning
 from torchpd.accuracy.candidates import safe_candidates
+from torchpd.accuracy.error import ExactStep, exact_steps, settled_steps
 from torchpd.accuracy.tuning import TuningWarning
 from torchpd.accuracy.tuning_result import Trial
 

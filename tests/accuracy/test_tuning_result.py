@@ -12,7 +12,8 @@ import torch
 from tuning_cases import bar, swinging, worst_error
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps, tuning
+from torchpd.accuracy import tuning
+from torchpd.accuracy.error import exact_steps
 from torchpd.accuracy.tuning import TuningWarning
 from torchpd.accuracy.tuning_result import Trial, TuningResult
 from torchpd.common.synonyms import Renamed

@@ -7,7 +7,7 @@ import torch
 from tuning_cases import bar
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps, problem_of
+from torchpd.accuracy.error import exact_steps, problem_of
 from torchpd.accuracy.unsolved_step import unsolved_step
 
 H = 1 / 60

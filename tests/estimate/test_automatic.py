@@ -17,7 +17,7 @@ from programs import ROOT
 from runs import same_bits, state_of
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps
+from torchpd.accuracy.error import exact_steps
 from torchpd.common.gpu import H100
 from torchpd.estimate import solver_choice as automatic
 from torchpd.estimate.convergence import MOST_OF_LEVELS

@@ -11,7 +11,7 @@ import torch
 from cases import sliver_mesh
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps
+from torchpd.accuracy.error import exact_steps
 from torchpd.estimate.convergence import Forecast, Spectrum, UnsolvedWarning, forecast, is_uneven, spectrum_of
 from torchpd.geometry.mesh_quality import smallest_dihedral
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps, frictionless
+from torchpd.accuracy.error import exact_steps, frictionless
 
 CANDIDATES = ["guarded Chebyshev", "damped Jacobi", "Multilevel"]  # of `tune`, in its order
 

@@ -16,7 +16,7 @@ from multilevel_cases import IDS, SOLVERS, swing
 from runs import displacement, moving, same_bits, simulate, simulator, state_of
 
 import torchpd as pd
-from torchpd.accuracy import problem_of
+from torchpd.accuracy.error import problem_of
 from torchpd.plan import placement as placing
 from torchpd.reference.solvers import relative_error
 

@@ -8,7 +8,7 @@ from runs import noise, same_bits, small
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.accuracy import exact_steps
+from torchpd.accuracy.error import exact_steps
 
 ONE = pytest.mark.parametrize("front", [(), (1,)], ids=["without a batch", "of one"])
 

@@ -15,8 +15,8 @@ import pytest
 import torch
 from PIL import Image
 
-from torchpd.accuracy import ExactStep
 from torchpd.accuracy.candidates import CANDIDATES, DEFAULT
+from torchpd.accuracy.error import ExactStep
 from torchpd.baselines import BASELINES
 from torchpd.baselines.dense_direct import DENSE
 from torchpd.study import StudyOptions, cost_table, paper_table, run_study, study_table

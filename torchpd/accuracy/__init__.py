@@ -1,13 +1,3 @@
-"""Errors of a step against converged ones, and tuning by them."""
+"""Errors of a step against converged ones, and tuning by them. Imports nothing: the baselines take 0.2 s to import."""
 
-from .error import Errors, ExactStep, exact_steps, frictionless, problem_of, scene_without_friction, settled_steps
-
-__all__ = [
-    "Errors",
-    "ExactStep",
-    "exact_steps",
-    "frictionless",
-    "problem_of",
-    "scene_without_friction",
-    "settled_steps",
-]
+__all__: list[str] = []

@@ -32,6 +32,7 @@ from ..scene.solvers import Chebyshev, Multilevel, Solver
 from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
 from ..simulation.state import State
+from .unsolved_step import ROUNDINGS
 
 if TYPE_CHECKING:
     from ..simulation.stepper import Stepper
@@ -59,8 +60,6 @@ _SURE = 1e-8  # uncertainty of a converged step that ends the search for a bette
 _FINE = {torch.float32: 1e-8, torch.float64: 1e-14}
 # steps with friction: iterations of Multilevel, then of successive runs of Chebyshev
 _LEADING, _SETTLING = 64, (256, 512, 1024, 2048, 4096, 8192)
-# machine epsilons of positions: rounding error of a body in free fall, and scatter of a stiff one
-ROUNDINGS = 10.0
 
 
 class Errors(NamedTuple):

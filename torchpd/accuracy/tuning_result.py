@@ -15,8 +15,7 @@ from ..plan.material import fingerprint
 from ..scene.solvers import Solver
 from ..scene.targets import Targets
 from ..simulation.state import Info, State
-from .error import ROUNDINGS
-from .unsolved_step import unsolved_step
+from .unsolved_step import ROUNDINGS, unsolved_step
 
 __all__ = ["Trial", "TuningResult"]
 

@@ -12,7 +12,10 @@ from ..ops.diagonal import named_material, pinned_vertices
 from ..plan.cpu_plan import Plan
 from ..simulation.state import State
 
-__all__ = ["unsolved_step"]
+__all__ = ["ROUNDINGS", "unsolved_step"]
+
+# machine epsilons of positions: rounding error of a body in free fall, and scatter of a stiff one
+ROUNDINGS = 10.0
 
 
 @torch.no_grad()
