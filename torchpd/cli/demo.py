@@ -134,14 +134,14 @@ def _simulate(sim: Simulator, mesh: TetMesh, steps: int) -> _Motion:
     return _Motion(start, track, seconds, mesh.embedding.apply(positions), mesh.embedding.surface.triangles)
 
 
-def _study(subject: str, sim: Simulator, motion: _Motion, hardest: int, options: DemoOptions) -> Path | None:
+def _study(body_name: str, sim: Simulator, motion: _Motion, hardest: int, options: DemoOptions) -> Path | None:
     """The convergence plot of the step whose objective is highest: elastic energy and sudden braking together."""
     before = motion.start if hardest == 0 else motion.track.state(hardest - 1)
     try:
         curves = compare_solvers(sim, before, iterations=128 if options.quick else 256, progress=True)
     except SolvedAlreadyError:
         return None  # too few steps to reach the ground: the body only falls
-    title = f"{subject}, the step of highest energy (t = {hardest * TIME_STEP:.2f} s)"
+    title = f"{body_name}, the step of highest energy (t = {hardest * TIME_STEP:.2f} s)"
     return plot_convergence(curves, options.out / "convergence.png", title=title, mark=options.iterations)
 
 

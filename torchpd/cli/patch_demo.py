@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 from ..api.patches import FreeFormPatches
 from ..api.simulator import Simulator
 from ..freeform.body import PatchBody
-from ..freeform.continuity import Seams, measure_seams
+from ..freeform.continuity import PatchContinuity, measure_continuity
 from ..freeform.quadrics import Quadrics
 from ..freeform.tessellation import tessellate
 from ..geometry.tri_mesh import TriMesh
@@ -28,13 +28,13 @@ from ..viewing.animation import write_surface
 from ..viewing.render import Picture, Studio, contact_sheet
 from .demo import TIME_STEP, DemoOptions, check_packages
 
-__all__ = ["PAPER_SCENES", "PatchScene", "PatchSubject", "run_patch_demo"]
+__all__ = ["PAPER_SCENES", "PatchScene", "PreparedScene", "run_patch_demo"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-class PatchSubject(NamedTuple):
+class PreparedScene(NamedTuple):
     """What is simulated, and where its grips are at the end of a step."""
 
     body: PatchBody
@@ -50,9 +50,9 @@ class PatchScene(NamedTuple):
     quadrics: int
     milliseconds: float  # of the paper
     frames_per_second: float  # of the paper
-    build: Callable[[int, float, int, torch.device], PatchSubject]  # quadrics, stiffness [Pa], steps
+    build: Callable[[int, float, int, torch.device], PreparedScene]  # quadrics, stiffness [Pa], steps
 
-    def subject(self, *, stiffness: float, steps: int, device: torch.device | str = "cpu") -> PatchSubject:
+    def prepare(self, *, stiffness: float, steps: int, device: torch.device | str = "cpu") -> PreparedScene:
         """The body and its scene; `stiffness` is st [Pa], and a motion goes on for `steps`."""
         return self.build(self.quadrics, stiffness, steps, torch.device(device))
 
@@ -64,7 +64,7 @@ class _Run(NamedTuple):
     body: PatchBody
     seconds: tuple[float, float]  # simulation, surface; a frame
     residual: float
-    seams: tuple[Seams, Seams]  # at rest and at the end
+    continuity: tuple[PatchContinuity, PatchContinuity]  # at rest and at the end
     frames: Array  # [1 + steps, n, 3]
     triangles: Index
 
@@ -136,7 +136,7 @@ def _held(body: PatchBody, mask: NDArray[np.bool_]) -> tuple[Pin, Array]:
     return pin, np.asarray(body.mesh.vertices[pin.vertices])
 
 
-def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PatchSubject:
+def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PreparedScene:
     """A flat, rounded bar, gripped at both ends, one of which makes half a turn."""
     mesh = spindle(30, 20, length=1.2, radius=0.2, power=8.0).scaled((1.0, 1.0, 0.4)).translated((0.0, 0.35, 0.0))
     body = _body(mesh, scattered(mesh, quadrics, height=0.2, seed=1), device, stiffness)
@@ -148,10 +148,10 @@ def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) ->
         moved = (rest - middle) @ _turns(np.pi * _share(step, steps), 0).T + middle
         return {grip: torch.tensor(moved, dtype=torch.float32, device=device)}
 
-    return PatchSubject(body, Scene(body, wall, grip, Damping(2.0)), targets)
+    return PreparedScene(body, Scene(body, wall, grip, Damping(2.0)), targets)
 
 
-def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PatchSubject:
+def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PreparedScene:
     """A sheet whose far end is led along the arcs of constant curvature."""
     length, most = 1.0, np.radians(150.0)
     mesh = sheet(25, 20, length=length, width=0.8)
@@ -165,14 +165,14 @@ def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> 
         moved = (rest - [length, 0.0, 0.0]) @ _turns(angle, 2).T + end
         return {grip: torch.tensor(moved, dtype=torch.float32, device=device)}
 
-    return PatchSubject(body, Scene(body, wall, grip, Damping(2.0)), targets)
+    return PreparedScene(body, Scene(body, wall, grip, Damping(2.0)), targets)
 
 
-def _drop(quadrics: int, stiffness: float, _steps: int, device: torch.device) -> PatchSubject:
+def _drop(quadrics: int, stiffness: float, _steps: int, device: torch.device) -> PreparedScene:
     """A ball that falls on the ground, a fifth as stiff as the others."""
     mesh = spindle(10, 10, length=0.6, radius=0.3, power=2.0).transformed(_turns(0.9, 2)).translated((0.0, 0.75, 0.0))
     body = _body(mesh, scattered(mesh, quadrics, height=0.25, seed=3), device, 0.2 * stiffness)
-    return PatchSubject(body, Scene(body, Gravity(), Ground(friction=0.5)), None)
+    return PreparedScene(body, Scene(body, Gravity(), Ground(friction=0.5)), None)
 
 
 PAPER_SCENES = (
@@ -197,13 +197,13 @@ def run_patch_demo(options: DemoOptions) -> str:
 
 
 def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, level: int) -> _Run:
-    subject = scene.subject(stiffness=0.5 * options.youngs, steps=options.steps, device=device)
-    body = subject.body
-    sim = Simulator(subject.scene, TIME_STEP, options.iterations, batch=1).to(device)
+    prepared = scene.prepare(stiffness=0.5 * options.youngs, steps=options.steps, device=device)
+    body = prepared.body
+    sim = Simulator(prepared.scene, TIME_STEP, options.iterations, batch=1).to(device)
     start = sim.rest_state()
-    sim.rollout(start, 2, targets=subject.targets)  # the first steps also allocate their workspace
+    sim.rollout(start, 2, targets=prepared.targets)  # the first steps also allocate their workspace
     begin = _now(device)
-    track = sim.rollout(start, options.steps, targets=subject.targets, return_info=True, progress=True)
+    track = sim.rollout(start, options.steps, targets=prepared.targets, return_info=True, progress=True)
     simulated = _now(device) - begin
     positions = torch.cat([start.positions[None], track.positions])
     if not bool(positions.isfinite().all()):
@@ -215,13 +215,13 @@ def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, lev
         begin = _now(device)
         frames = [body.patches.surface(grid.samples, body.pose(x), heights=heights).points for x in positions]
         surfaced = _now(device) - begin
-        seams = measure_seams(body.patches), measure_seams(body.patches, body.pose(positions[-1]))
+        continuity = measure_continuity(body.patches), measure_continuity(body.patches, body.pose(positions[-1]))
     return _Run(
         scene,
         body,
         (simulated / options.steps, surfaced / len(positions)),
         float(track.info.residual.amax()),
-        seams,
+        continuity,
         torch.cat(frames).double().cpu().numpy(),
         grid.triangles.cpu().numpy(),
     )
@@ -277,9 +277,9 @@ def _report(runs: list[_Run], options: DemoOptions, level: int, drawing: list[fl
         "across the edges of patches, at rest and at the end:",
     ]
     for run in runs:
-        rest, end = run.seams
+        rest, end = run.continuity
         lines.append(
-            f"  {run.scene.name}: gap {rest.gap:.1e}, {end.gap:.1e} m; crease mean {rest.mean:.1f}, {end.mean:.1f}, "
-            f"most {rest.most:.1f}, {end.most:.1f} degrees"
+            f"  {run.scene.name}: gap {rest.gap:.1e}, {end.gap:.1e} m; crease angle mean {rest.mean_angle:.1f}, "
+            f"{end.mean_angle:.1f}, largest {rest.largest_angle:.1f}, {end.largest_angle:.1f} degrees"
         )
     return "\n".join([*lines, "", "written:", *(f"  {file}" for file in files)])
