@@ -45,9 +45,8 @@ def main() -> None:
 
     end = measure_continuity(patches, body.pose(track.positions[-1]))
     print(f"lowest point {float(frames[-1, :, 1].min()):.3f} m, residual {float(track.info.residual[-1]):.1e}")
-    print(
-        f"between patches: gaps up to {end.gap:.1e} m, creases of {end.mean_angle:.1f} degrees, up to {end.largest_angle:.1f}"
-    )
+    angles = f"{end.mean_angle:.1f} degrees, up to {end.largest_angle:.1f}"
+    print(f"between patches: gaps up to {end.gap:.1e} m, creases of {angles}")
     print(f"written: {options.out}, {len(grid.triangles)} triangles in {len(frames)} frames")
 
 

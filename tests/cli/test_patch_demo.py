@@ -59,7 +59,7 @@ def test_demo_draws_and_times_the_three_scenes(tmp_path: Path, capsys: pytest.Ca
         # both times are rounded to the last digit that they are printed with
         slack = sum(0.5 * 10.0 ** -len(word.partition(".")[2]) for word in row[4:6])
         assert 1e3 / (simulation + surface + slack) - 1.0 <= rate <= 1e3 / (simulation + surface - slack) + 1.0
-    assert len(re.findall(r"gap \S+ \S+ m; crease mean", text)) == 3
+    assert len(re.findall(r"gap \S+ \S+ m; crease angle mean", text)) == 3
     listed = {Path(line.strip()) for line in text.split("written:")[1].splitlines() if line.strip()}
     assert listed == set(tmp_path.iterdir())
     sheet = np.asarray(Image.open(tmp_path / "patches.png").convert("RGB")).astype(int)

@@ -1,4 +1,4 @@
-"""Bodies of free-form patches as large as the source paper's, in motion: simulated, tessellated, drawn and timed."""
+"""Free-form patch bodies of the source paper's size in motion: simulated, tessellated, rendered and timed."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Index = NDArray[np.int64]
 
 
 class PreparedScene(NamedTuple):
-    """What is simulated, and where its grips are at the end of a step."""
+    """A body in its scene, and the targets of its grips at the end of a step."""
 
     body: PatchBody
     scene: Scene
@@ -43,26 +43,26 @@ class PreparedScene(NamedTuple):
 
 
 class PatchScene(NamedTuple):
-    """As many patches and quadrics as a scene of Vyatkin and Dolgovesov (2023), and what a frame took on a GTX 470."""
+    """A scene with as many patches and quadrics as one of Vyatkin and Dolgovesov (2023), and its time on a GTX 470."""
 
     name: str
     patches: int
     quadrics: int
-    milliseconds: float  # of the paper
+    milliseconds: float  # per frame, of the paper
     frames_per_second: float  # of the paper
     build: Callable[[int, float, int, torch.device], PreparedScene]  # quadrics, stiffness [Pa], steps
 
     def prepare(self, *, stiffness: float, steps: int, device: torch.device | str = "cpu") -> PreparedScene:
-        """The body and its scene; `stiffness` is st [Pa], and a motion goes on for `steps`."""
+        """Build the body and its scene; `stiffness` is st [Pa], `steps` the length of the motion."""
         return self.build(self.quadrics, stiffness, steps, torch.device(device))
 
 
 class _Run(NamedTuple):
-    """What one scene gave."""
+    """Result of one scene."""
 
     scene: PatchScene
     body: PatchBody
-    seconds: tuple[float, float]  # simulation, surface; a frame
+    seconds: tuple[float, float]  # simulation and surface, per frame
     residual: float
     continuity: tuple[PatchContinuity, PatchContinuity]  # at rest and at the end
     frames: Array  # [1 + steps, n, 3]
@@ -70,7 +70,7 @@ class _Run(NamedTuple):
 
 
 def spindle(rings: int, sectors: int, *, length: float, radius: float, power: float) -> TriMesh:
-    """A surface of revolution about x with 2 rings sectors triangles: a ball for power 2, a rounded bar for more."""
+    """A surface of revolution about x with 2 rings sectors triangles; power 2 is an ellipsoid, more flattens it."""
     along = (
         -np.cos(np.pi * np.arange(1, rings + 1) / (rings + 1)) if power <= 2 else np.linspace(-1, 1, rings + 2)[1:-1]
     )
@@ -83,7 +83,7 @@ def spindle(rings: int, sectors: int, *, length: float, radius: float, power: fl
     odd, after = ring % 2, (sector + 1) % sectors
     a, b = ring * sectors + sector, ring * sectors + after
     c, d = a + sectors, b + sectors
-    # rings are turned by half a sector against each other: the diagonal is the shorter one
+    # each ring is rotated by half a sector against the last: this makes the diagonal the shorter one
     first = np.where(odd[:, None], np.stack([a, d, b], 1), np.stack([a, c, b], 1))
     second = np.where(odd[:, None], np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     start, end, last = rings * sectors, rings * sectors + 1, (rings - 1) * sectors
@@ -104,7 +104,7 @@ def sheet(columns: int, rows: int, *, length: float, width: float) -> TriMesh:
 
 
 def scattered(mesh: TriMesh, count: int, *, height: float, seed: int) -> Quadrics:
-    """Quadrics evenly at random over a surface, about an edge wide, bumps and dents up to `height` of their radius."""
+    """Random quadrics over a surface, about an edge wide; bumps and dents have heights up to `height` of their radius."""
     rng = np.random.default_rng(seed)
     corners = mesh.vertices[mesh.triangles]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
@@ -122,12 +122,12 @@ def _body(mesh: TriMesh, quadrics: Quadrics, device: torch.device, stiffness: fl
 
 
 def _turns(angle: float, axis: int) -> Array:
-    """The rotation about an axis."""
+    """The rotation by an angle about an axis."""
     return np.asarray(Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix())
 
 
 def _share(step: int, steps: int) -> float:
-    """From 0 to 1 over the first three quarters of the motion, then 1."""
+    """Fraction of the motion: 0 to 1 over the first three quarters of the steps, then 1."""
     return min(1.0, (step + 1) / (0.75 * steps))
 
 
@@ -137,7 +137,7 @@ def _held(body: PatchBody, mask: NDArray[np.bool_]) -> tuple[Pin, Array]:
 
 
 def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PreparedScene:
-    """A flat, rounded bar, gripped at both ends, one of which makes half a turn."""
+    """A flat, rounded bar, gripped at both ends; one grip makes half a turn."""
     mesh = spindle(30, 20, length=1.2, radius=0.2, power=8.0).scaled((1.0, 1.0, 0.4)).translated((0.0, 0.35, 0.0))
     body = _body(mesh, scattered(mesh, quadrics, height=0.2, seed=1), device, stiffness)
     x = body.mesh.vertices[:, 0]
@@ -152,7 +152,7 @@ def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) ->
 
 
 def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PreparedScene:
-    """A sheet whose far end is led along the arcs of constant curvature."""
+    """A sheet whose far end follows arcs of constant curvature."""
     length, most = 1.0, np.radians(150.0)
     mesh = sheet(25, 20, length=length, width=0.8)
     body = _body(mesh, scattered(mesh, quadrics, height=0.2, seed=2), device, stiffness, apex="prism", thickness=0.04)
@@ -169,7 +169,7 @@ def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> 
 
 
 def _drop(quadrics: int, stiffness: float, _steps: int, device: torch.device) -> PreparedScene:
-    """A ball that falls on the ground, a fifth as stiff as the others."""
+    """A ball that falls on the ground, with a fifth of the others' stiffness."""
     mesh = spindle(10, 10, length=0.6, radius=0.3, power=2.0).transformed(_turns(0.9, 2)).translated((0.0, 0.75, 0.0))
     body = _body(mesh, scattered(mesh, quadrics, height=0.25, seed=3), device, 0.2 * stiffness)
     return PreparedScene(body, Scene(body, Gravity(), Ground(friction=0.5)), None)
@@ -183,7 +183,7 @@ PAPER_SCENES = (
 
 
 def run_patch_demo(options: DemoOptions) -> str:
-    """Write a picture and moving surfaces of the three scenes to `options.out`; the report to print."""
+    """Write a picture and moving surfaces of the three scenes to `options.out`; returns the report to print."""
     check_packages()
     device = find_device(options.device)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -207,10 +207,10 @@ def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, lev
     simulated = _now(device) - begin
     positions = torch.cat([start.positions[None], track.positions])
     if not bool(positions.isfinite().all()):
-        raise ValueError("the motion left the range of numbers; a larger Young's modulus may help (--youngs)")
+        raise ValueError("positions must stay finite, got inf or NaN in the motion; try a larger --youngs")
     grid = tessellate(body.patches, level)
     with torch.no_grad():
-        heights = body.patches.heights(grid.samples)  # they belong to the material
+        heights = body.patches.heights(grid.samples)  # constant in the material
         body.patches.surface(grid.samples, body.pose(positions[0]), heights=heights)
         begin = _now(device)
         frames = [body.patches.surface(grid.samples, body.pose(x), heights=heights).points for x in positions]
@@ -228,14 +228,14 @@ def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, lev
 
 
 def _now(device: torch.device) -> float:
-    """Seconds, after the device has done what it was given."""
+    """Time [s] after the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def _draw(runs: list[_Run], options: DemoOptions) -> list[float]:
-    """One row of pictures for each scene; the seconds that a picture of each took."""
+    """Render one row of pictures per scene; returns the seconds per picture of each."""
     columns, size, samples = (3, (240, 180), 4) if options.quick else (4, (480, 360), 9)
     pictures: list[Picture] = []
     captions: list[str] = []

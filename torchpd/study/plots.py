@@ -27,8 +27,8 @@ __all__ = [
 
 TOP = 2.0  # where a failure is drawn: above the first iterate, whose error is 1
 _LOWEST = 1e-7
-# Okabe and Ito's palette, distinct under every kind of colour blindness. Solvers of this library have strong colours and
-# full lines; published methods have thin lines, dashed where Python takes much of their time.
+# Okabe and Ito's palette, distinct under every kind of colour blindness. Solvers of this library have strong colours
+# and full lines; published methods have thin lines, dashed where Python takes much of their time.
 STYLES: dict[str, tuple[str, float, str]] = {
     DEFAULT: ("#d55e00", 2.8, "solid"),
     "classic Chebyshev": ("#0072b2", 2.0, "solid"),
