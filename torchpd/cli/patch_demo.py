@@ -104,7 +104,7 @@ def sheet(columns: int, rows: int, *, length: float, width: float) -> TriMesh:
 
 
 def scattered(mesh: TriMesh, count: int, *, height: float, seed: int) -> Quadrics:
-    """Random quadrics over a surface, about an edge wide; bumps and dents have heights up to `height` of their radius."""
+    """Random quadrics over a surface, about an edge wide; bumps and dents up to `height` of their radius."""
     rng = np.random.default_rng(seed)
     corners = mesh.vertices[mesh.triangles]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
