@@ -11,7 +11,7 @@ import trimesh
 from patch_cases import ball, sheet
 
 import torchpd as pd
-from torchpd.freeform.targets import CloudTarget, FieldTarget, MeshTarget, along, project, target_of
+from torchpd.freeform.targets import CloudTarget, FieldTarget, MeshTarget, intersect_lines, project, target_of
 
 BOX = [[-1.5] * 3, [1.5] * 3]
 

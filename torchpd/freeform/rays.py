@@ -274,8 +274,8 @@ def _cells(patches: PatchSurface, level: int) -> tuple[Any, Any, Any]:
 def _tree_order(middles: Any, per_leaf: int) -> Any:
     """The order of the leaves: halved at the median of the longest extent, recursively.
 
-    The halves are those of the complete tree in csrc/freeform/box_tree.h: leaf l of 2^L starts at l C / 2^L, and each has
-    at least `per_leaf` items.
+    The halves are those of the complete tree in csrc/freeform/box_tree.h: leaf l of 2^L starts at l C / 2^L, and each
+    has at least `per_leaf` items.
     """
     count = len(middles)
     order = np.arange(count)

@@ -18,7 +18,7 @@ from ..common.reprs import by_sizes
 from ..geometry.mesh_checks import set_frozen
 from ..geometry.tri_mesh import TriMesh
 from . import ops as patch_ops  # noqa: F401  (registers the ops)
-from .adjacency import TouchingPairs, gather_lists, touching
+from .adjacency import TouchingPairs, find_touching_pairs, gather_lists
 from .checks import angle_weighted_normals, check_surface
 from .quadrics import Quadrics, check_real_tensor, dimensions, matrix_sets
 

@@ -9,7 +9,7 @@ quadratic too:
     E(u)    = sum_i a_i / 2 |u_i - s_i|^2 + sum_e w_e V_e / 2 |F_e(x_t + u) - R_e|^2
 
 with F = sum_a x_a (x) grad N_a and R its nearest rotation. Hard pins hold u_i = target_i - x_t,i and add nothing to E.
-`reference_solvers` holds the methods that minimise E.
+`reference.solvers` holds the methods that minimise E.
 """
 
 from __future__ import annotations

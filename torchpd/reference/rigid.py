@@ -6,7 +6,7 @@ The constraints leave these motions:
 - Hard pins at one point or along a line leave rotations about it.
 - Frictionless planes leave the rotation about their normal and the translation along all of them.
 - One plane with friction, or the edge of two planes, leaves the translation along it, shortened by Coulomb's law.
-- On one plane a component may also tip or roll (`reference_tipping`).
+- On one plane a component may also tip or roll (`reference.tipping`).
 - A component above all planes moves until it reaches the first.
 
 All other contacts leave no motion. Where a motion ends at a contact, the next one continues from there.
