@@ -35,7 +35,7 @@ from torchpd.estimate.convergence import forecast
 from torchpd.estimate.solver_choice import CPU_CHEBYSHEV, Cost, multilevel_cost
 from torchpd.scene.solvers import Solver
 from torchpd.study.bench import clock_of
-from torchpd.study.scenes import SUBJECTS
+from torchpd.study.scenes import STUDY_SCENES
 
 SIZES = {"256": 3, "1k": 5, "3k": 8, "10k": 12, "30k": 18, "100k": 26}  # cells across
 ALONE = [size for size in SIZES if size != "256"]  # unless asked for: smaller ones come in batches
@@ -54,12 +54,12 @@ class Case:
     def __init__(
         self, cells: int, youngs: float, device: torch.device, dtype: torch.dtype = torch.float32, batch: int = 1
     ) -> None:
-        subject = SUBJECTS["beam"]()
-        self.scene = subject.scene(subject.mesh(cells), youngs)
-        self.time_step = subject.time_step
+        studied = STUDY_SCENES["beam"]()
+        self.scene = studied.scene(studied.mesh(cells), youngs)
+        self.time_step = studied.time_step
         self.batch = batch
         wide = self.simulator(torch.float64, torch.device("cpu"), pd.Multilevel())
-        start = pd.State(*(part.float() for part in subject.start(wide)))
+        start = pd.State(*(part.float() for part in studied.start(wide)))
         self.solution, self.uncertainty = converged(wide, pd.State(*(part.double() for part in start)))
         self.sim = self.simulator(dtype, device, pd.Chebyshev())
         self.state = pd.State(*(part.to(device, dtype).repeat(batch, 1, 1) for part in start))

@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 import torchpd as tpd
-from torchpd.freeform.continuity import measure_seams
+from torchpd.freeform.continuity import measure_continuity
 from torchpd.viewing.animation import write_surface
 
 TIME_STEP = 1 / 60  # s
@@ -43,9 +43,10 @@ def main() -> None:
     frames = patches.surface(grid.samples, pose, heights=patches.heights(grid.samples)).points
     write_surface(options.out, frames, grid.triangles, frames_per_second=1.0 / TIME_STEP)
 
-    end = measure_seams(patches, body.pose(track.positions[-1]))
+    end = measure_continuity(patches, body.pose(track.positions[-1]))
     print(f"lowest point {float(frames[-1, :, 1].min()):.3f} m, residual {float(track.info.residual[-1]):.1e}")
-    print(f"between patches: gaps up to {end.gap:.1e} m, creases of {end.mean:.1f} degrees, up to {end.most:.1f}")
+    angles = f"{end.mean_angle:.1f} degrees, up to {end.largest_angle:.1f}"
+    print(f"between patches: gaps up to {end.gap:.1e} m, creases of {angles}")
     print(f"written: {options.out}, {len(grid.triangles)} triangles in {len(frames)} frames")
 
 

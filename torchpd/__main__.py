@@ -16,27 +16,28 @@ __all__ = ["main"]
 _DEMO = """\
 Drops an elastic body on the ground and writes pictures, films and a convergence plot.
 
-MESH is a surface (.obj, .ply, .stl, .glb, .usd, ...), which is filled with a lattice of tetrahedra, or a volume mesh
-(.mesh, .msh, .vtk, .vtu, .inp, ...). It is scaled to a metre. Without MESH: an octopus.
+MESH is a surface (.obj, .ply, .stl, .glb, .usd, ...), which is filled with tetrahedra, or a tetrahedral mesh
+(.mesh, .msh, .vtk, .vtu, .inp, ...). It is scaled to one metre. Default: an octopus.
 
---patches: bodies of free-form patches instead, as large as the three scenes of the source paper, which are twisted,
-bent and dropped; a picture, moving surfaces, and what a frame costs beside the published times."""
+--patches: simulates bodies of free-form patches instead, as large as the three scenes of the source paper. They are
+twisted, bent and dropped. Writes a picture and moving surfaces, and compares the time of a frame with the paper's."""
 
 _STUDY = """\
-Measures what accuracy costs: the error of the solver against iterations, milliseconds and memory, beside methods of
-the literature; the errors of the time step, of the mesh and of float32; and what unfinished solves do to a motion.
+Measures the cost of accuracy: error of the solver against iterations, milliseconds and memory, beside published
+methods. Also measures the errors of the time step, of the mesh and of float32, and the effect of unconverged steps on
+a motion.
 
-SUBJECT is beam, octopus, or the file of a mesh, which lands on the ground. There methods that know no contacts (Newton,
-L-BFGS, Gauss-Seidel, conjugate gradients, a factorised step) are refused; --scene held is for all of them.
+SUBJECT is beam, octopus, or a mesh file. Bodies land on the ground. Methods without contacts (Newton, L-BFGS,
+Gauss-Seidel, conjugate gradients, a factorised step) are refused there; with --scene held all methods run.
 
-Results go to --out: study.json, study.csv, pictures and report.html. A study that was stopped goes on where it was."""
+Results go to --out: study.json, study.csv, pictures and report.html. An interrupted study resumes."""
 
 
 _CELLS = 24
 
 
 def _whole(text: str) -> int:
-    """A whole number >= 1."""
+    """Parse an integer >= 1."""
     try:
         number = int(text)
     except ValueError:
@@ -47,7 +48,7 @@ def _whole(text: str) -> int:
 
 
 def _positive(text: str) -> float:
-    """A finite number > 0."""
+    """Parse a finite number > 0."""
     try:
         number = float(text)
     except ValueError:
@@ -63,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     demo = commands.add_parser(
         "demo",
-        help="drop an elastic body, draw it and measure the error",
+        help="drop an elastic body, render it and measure the error",
         description=_DEMO,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -71,37 +72,37 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--cells", type=_whole, help=f"lattice cells along the longest side ({_CELLS})")
     demo.add_argument("--steps", type=_whole, default=120, help="time steps of 1/60 s (%(default)s)")
     demo.add_argument("--youngs", type=_positive, default=3e4, help="Young's modulus in Pa (%(default)g)")
-    demo.add_argument("--iterations", type=_whole, default=64, help="iterations of a time step (%(default)s)")
+    demo.add_argument("--iterations", type=_whole, default=64, help="iterations per time step (%(default)s)")
     demo.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
-    demo.add_argument("--out", type=Path, default=Path("out"), help="folder for the files (%(default)s)")
+    demo.add_argument("--out", type=Path, default=Path("out"), help="output folder (%(default)s)")
     demo.add_argument("--quick", action="store_true", help="fewer and smaller pictures")
-    demo.add_argument("--patches", action="store_true", help="bodies of free-form patches, without MESH and --cells")
+    demo.add_argument("--patches", action="store_true", help="simulate free-form patches; without MESH and --cells")
     _add_study(commands)
-    commands.add_parser("doctor", help="print versions, devices, and what is missing")
+    commands.add_parser("doctor", help="print versions, devices, and missing parts with their fix")
     return parser
 
 
 def _add_study(commands: Any) -> None:
     study = commands.add_parser(
         "study",
-        help="measure what accuracy costs",
+        help="measure the cost of accuracy",
         description=_STUDY,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    study.add_argument("subject", nargs="?", default="beam", metavar="SUBJECT", help="beam, octopus or a mesh")
-    study.add_argument("--scene", help="of a body: lands (the default), or held by its lowest tenth, without contacts")
+    study.add_argument("subject", nargs="?", default="beam", metavar="SUBJECT", help="beam, octopus or a mesh file")
+    study.add_argument("--scene", help="motion of a body: lands (default), or held at its lowest tenth, no contacts")
     study.add_argument("--youngs", type=_positive, help="Young's modulus in Pa")
-    study.add_argument("--time-step", type=_positive, help="in s")
+    study.add_argument("--time-step", type=_positive, help="time step in s")
     study.add_argument("--resolution", type=_whole, help="cells across the beam, or along the longest side of a body")
-    study.add_argument("--iterations", type=_whole, default=1024, help="of a step, at most (%(default)s)")
+    study.add_argument("--iterations", type=_whole, default=1024, help="most iterations per step (%(default)s)")
     study.add_argument("--axes", nargs="+", metavar="AXIS", help="only these: solver, stiffness, float, time-step, ...")
     study.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
-    study.add_argument("--threads", type=_whole, help="of the CPU")
-    study.add_argument("--out", type=Path, default=Path("out/study"), help="folder for the files (%(default)s)")
+    study.add_argument("--threads", type=_whole, help="CPU threads")
+    study.add_argument("--out", type=Path, default=Path("out/study"), help="output folder (%(default)s)")
     study.add_argument(
         "--quick",
         action="store_true",
-        help="few points, timed by few calls, to see that everything runs: 8 iterations at most",
+        help="few points and at most 8 iterations, only to check that everything runs",
     )
 
 
@@ -110,7 +111,7 @@ def _study(arguments: argparse.Namespace) -> str:
 
     options = {name: value for name, value in vars(arguments).items() if name != "command"}
     chosen = [axis.replace("-", " ") for axis in options.pop("axes") or AXES]
-    # in the order of the study, unknown ones last, which it names
+    # in the order of the study, then unknown ones, for its error message
     axes = tuple(sorted(set(chosen), key=lambda axis: AXES.index(axis) if axis in AXES else len(AXES)))
     return run_study(StudyOptions(**options, axes=axes))
 
@@ -128,10 +129,10 @@ def _demo(arguments: argparse.Namespace) -> str:
 
 
 def _check_out(out: Path) -> None:
-    """Say that a file is in the way of the folder before the work, and not after it."""
+    """Refuse a file in place of the output folder before the work, not after it."""
     there = next((place for place in (out, *out.parents) if place.exists()), None)
     if there is not None and not there.is_dir():
-        raise NotADirectoryError(f"--out must be a folder, or the name of one to be made, got the file {there}")
+        raise NotADirectoryError(f"--out must be a folder or a new name, got the file {there}")
 
 
 def _doctor() -> int:
@@ -142,11 +143,11 @@ def _doctor() -> int:
 
 
 def main(words: Sequence[str] | None = None) -> int:
-    """Run one command; 0, 1 when the doctor finds a problem, 2 after a sentence on a bad request, 130 interrupted."""
+    """Run one command; returns 0, 1 if the doctor found a problem, 2 after a bad request, 130 if interrupted."""
     arguments = _parser().parse_args(words)
     try:
         with warnings.catch_warnings():
-            # what was repaired in a mesh is news for the user, not for a developer: no file and line
+            # mesh repairs are messages to the user, not to a developer: without file and line
             warnings.showwarning = lambda message, *_, **__: print(f"note: {message}", file=sys.stderr)
             if arguments.command == "doctor":
                 return _doctor()
@@ -161,7 +162,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 
 def _one_line(error: BaseException) -> str:
-    """The message in one line; what some libraries append to it (stacks, advice) is left out."""
+    """First line of the message; some libraries append stacks or advice, which is dropped."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 

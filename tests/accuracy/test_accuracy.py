@@ -21,7 +21,7 @@ from torchpd.accuracy.error import (
 from torchpd.baselines.contact_newton import ContactNewton
 from torchpd.reference import StepProblem, step_problem
 from torchpd.reference.solvers import newton, newton_step, solve_with_contact
-from torchpd.study.scenes import SUBJECTS
+from torchpd.study.scenes import STUDY_SCENES
 
 
 def test_the_first_iterate_has_error_one_and_the_solution_none() -> None:
@@ -116,10 +116,10 @@ def test_contacts_are_solved_without_friction() -> None:
 @pytest.mark.parametrize(("cells", "youngs"), [(8, 1e8), (12, 1e7)])
 def test_stiff_beams_are_solved(cells: int, youngs: float) -> None:
     """3,321 and 10,309 vertices, on which 500 iterations of Chebyshev do not halve the residual."""
-    subject = SUBJECTS["beam"]()
-    scene = subject.scene(subject.mesh(cells), youngs)
-    sim = pd.Simulator(scene, subject.time_step, 100, pd.Multilevel(), torch.float64, progress=False)
-    state = subject.start(sim)
+    studied = STUDY_SCENES["beam"]()
+    scene = studied.scene(studied.mesh(cells), youngs)
+    sim = pd.Simulator(scene, studied.time_step, 100, pd.Multilevel(), torch.float64, progress=False)
+    state = studied.start(sim)
     step = exact_steps(sim, state)[0]
     after, info = sim(state, return_info=True)
     assert float(info.residual) < 1e-12
@@ -214,7 +214,7 @@ def test_settled_steps_are_the_fixed_point_of_friction() -> None:
     for item, step in enumerate(settled_steps(sim, state)):
         x, v = (part[item].numpy() for part in state)
         problem = step_problem(sim.scene.values(), x, v, sim.time_step)
-        left, course = (np.linalg.norm(problem.residual(u)) for u in (step.solution, problem.course()))
+        left, course = (np.linalg.norm(problem.residual(u)) for u in (step.solution, problem.unsolved()))
         assert step.uncertainty < 1e-6
         assert left < 1e-6 * course
         assert np.abs(step.solution - smooth[item].solution).max() > 1e-3

@@ -167,7 +167,7 @@ def test_a_step_that_is_too_long_is_halved() -> None:
     """Ten times too long on a quadratic: 10, 5 and 2.5 rise, 1.25 of the way falls by enough."""
     problem = contact_block(velocity=(1.0, 0.0, 0.0), gravity=(0.0, 0.0, 0.0)).problem()
     zero = np.zeros_like(problem.positions)
-    with pytest.raises(RuntimeError, match="iteration 0 fails to lower the energy"):
+    with pytest.raises(RuntimeError, match=r"iteration 0.*backtrack=True"):
         preconditioned_lbfgs(problem, zero, factorised(problem), iterations=1, relaxation=10.0)
     found = preconditioned_lbfgs(problem, zero, factorised(problem), iterations=1, relaxation=10.0, backtrack=True)
     assert np.allclose(found, 1.25 * problem.target, rtol=0, atol=1e-12)
@@ -229,11 +229,11 @@ def test_dense_inverses_have_the_iterates_of_the_factorisation(
 
 def test_dense_inverses_refuse_contacts_and_large_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
     resting = contact_block(pd.Ground(0.0))
-    with pytest.raises(ValueError, match="knows no contacts"):
+    with pytest.raises(ValueError, match=r"no contacts.*1 planes"):
         DenseDirect(simulator(resting, torch.float64), resting.problem())
     monkeypatch.setattr(dense_direct, "MOST_VERTICES", 40)
     case = swinging()
-    with pytest.raises(ValueError, match="for up to 40 vertices; this scene has 63"):
+    with pytest.raises(ValueError, match=r"vertices.* 40 .*63"):
         DenseDirect(simulator(case, torch.float64), case.problem())
 
 
@@ -301,7 +301,7 @@ def test_memory_is_watched_and_contacts_are_refused(problem: StepProblem) -> Non
     # at least the iterates that are kept, and the sparse operator
     assert trace.peak_bytes > problem.operator.data.nbytes
     resting = contact_block(pd.Ground(0.0)).problem()
-    with pytest.raises(ValueError, match="knows no contacts"):
+    with pytest.raises(ValueError, match=r"no contacts.*1 planes"):
         run_baseline(BASELINES["Newton"], resting, resting.first_iterate(), 1)
     assert run_baseline(BASELINES["guarded Chebyshev, NumPy"], resting, resting.first_iterate(), 2).last == 2
 
@@ -316,7 +316,7 @@ def test_newton_krylov_finds_contacts(ground: pd.Ground) -> None:
     assert sorted(trace.displacements) == list(range(trace.last + 1))
     assert trace.local_steps[trace.last] > trace.last > 1
     rough = contact_block(pd.Ground(0.0, friction=0.5)).problem()
-    with pytest.raises(ValueError, match="knows no friction"):
+    with pytest.raises(ValueError, match="friction"):
         run_baseline(BASELINES["Newton-PCG with M"], rough, rough.first_iterate(), 1)
 
 

@@ -151,7 +151,7 @@ def test_a_file_in_the_way_of_the_folder_is_named_at_once(
     for out in (tmp_path / "afile", tmp_path / "afile" / "below"):
         assert main([*words, "--out", str(out)]) == 2
         said = capsys.readouterr().err
-        assert said.startswith("torchpd: --out must be a folder, or the name of one to be made, got the file")
+        assert said.startswith("torchpd: --out must be a folder or a new name, got the file")
         assert said.count("\n") == 1
 
 

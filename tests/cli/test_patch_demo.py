@@ -13,28 +13,28 @@ from PIL import Image
 import torchpd as pd
 from torchpd.__main__ import main
 from torchpd.cli.patch_demo import PAPER_SCENES, PatchScene, spindle
-from torchpd.freeform.continuity import measure_seams
+from torchpd.freeform.continuity import measure_continuity
 
 
 @pytest.mark.parametrize("scene", PAPER_SCENES, ids=lambda scene: scene.name)
 def test_scenes_are_as_large_as_published(scene: PatchScene) -> None:
     published = {"twist": (1200, 3832), "bend": (1000, 3484), "drop": (200, 664)}
-    body = scene.subject(stiffness=1.5e4, steps=8).body
+    body = scene.prepare(stiffness=1.5e4, steps=8).body
     assert (len(body.patches.triangles), len(body.patches.quadrics)) == published[scene.name]
-    again = scene.subject(stiffness=1.5e4, steps=8).body
+    again = scene.prepare(stiffness=1.5e4, steps=8).body
     assert torch.equal(body.patches.quadrics.centres, again.patches.quadrics.centres)
 
 
 @pytest.mark.parametrize("scene", PAPER_SCENES, ids=lambda scene: scene.name)
 def test_scenes_move_without_gaps(scene: PatchScene) -> None:
-    subject = scene.subject(stiffness=1.5e4, steps=30)
-    sim = pd.Simulator(subject.scene, 1 / 60, 64)
-    track = sim.rollout(sim.rest_state(), 30, targets=subject.targets, return_info=True)
+    prepared = scene.prepare(stiffness=1.5e4, steps=30)
+    sim = pd.Simulator(prepared.scene, 1 / 60, 64)
+    track = sim.rollout(sim.rest_state(), 30, targets=prepared.targets, return_info=True)
     assert float(track.info.residual.max()) < 0.1
-    body = subject.body
+    body = prepared.body
     pose = body.pose(track.positions[-1])
     assert float((pose.positions - body.patches.vertices).norm(dim=-1).max()) > 0.1
-    assert measure_seams(body.patches, pose).gap <= 2**-22  # float32 numbers of about 1
+    assert measure_continuity(body.patches, pose).gap <= 2**-22  # float32 numbers of about 1
     mesh = body.patches.mesh(2, pose).to_trimesh()
     assert mesh.is_watertight == (scene.name != "bend")
 
@@ -59,7 +59,7 @@ def test_demo_draws_and_times_the_three_scenes(tmp_path: Path, capsys: pytest.Ca
         # both times are rounded to the last digit that they are printed with
         slack = sum(0.5 * 10.0 ** -len(word.partition(".")[2]) for word in row[4:6])
         assert 1e3 / (simulation + surface + slack) - 1.0 <= rate <= 1e3 / (simulation + surface - slack) + 1.0
-    assert len(re.findall(r"gap \S+ \S+ m; crease mean", text)) == 3
+    assert len(re.findall(r"gap \S+ \S+ m; crease angle mean", text)) == 3
     listed = {Path(line.strip()) for line in text.split("written:")[1].splitlines() if line.strip()}
     assert listed == set(tmp_path.iterdir())
     sheet = np.asarray(Image.open(tmp_path / "patches.png").convert("RGB")).astype(int)

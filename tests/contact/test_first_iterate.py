@@ -109,7 +109,7 @@ def test_it_starts_where_it_is_from_that_stiffness_on(weighted: bool, dtype: tor
     for factor in (0.99, 1.01):
         case = sinking(factor * critical)
         problem = rounded_problem(case, dtype)
-        course = problem.align(problem.course(), first=True)
+        course = problem.align(problem.unsolved(), first=True)
         still = problem.align(np.zeros_like(course), first=True)
         assert np.abs(course - still).max() > 1e-3
         sim = simulator(case, dtype, device, solver=solver, iterations=0)
@@ -141,14 +141,14 @@ def on(*planes: pd.Part, **options: object) -> tuple[StepProblem, Case]:
 def test_balls_and_pins_leave_it_on_its_course() -> None:
     """What rigid motions do not free from the squeeze keeps its momentum."""
     lands, _ = on(pd.Ground(-0.001))
-    assert (lands.first_iterate() - lands.align(lands.course(), first=True)).any()
+    assert (lands.first_iterate() - lands.align(lands.unsolved(), first=True)).any()
     for part in (pd.Sphere((0.15, -0.2, 0.15), 0.199), None):
         problem, case = on(pd.Ground(-0.001)) if part is None else on(part)
         if part is None:
             body = case.scene.solids[0]
             pinned = pd.Scene(*case.scene.parts, pd.Pin(body, [0]))
             problem = replace(case, scene=pinned).problem()
-        assert np.array_equal(problem.first_iterate(), problem.align(problem.course(), first=True))
+        assert np.array_equal(problem.first_iterate(), problem.align(problem.unsolved(), first=True))
 
 
 def best_landing(problem: StepProblem) -> Array:

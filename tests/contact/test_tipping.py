@@ -105,7 +105,7 @@ def test_what_slides_on_an_edge_rubs_where_that_is_pushed(dtype: torch.dtype, de
 def test_in_the_oracle_it_rubs_there_as_well() -> None:
     case = sliding_on_an_edge()
     problem = step_problem(case.scene.values(), case.positions, case.velocities, H)
-    u = problem.align(problem.course(), first=True)
+    u = problem.align(problem.unsolved(), first=True)
     check_that_it_rubs_where_it_is_pushed(case, case.positions + u, u / H, ULP[torch.float64], 1e-12)
 
 
@@ -130,7 +130,7 @@ def check_that_converged_steps_stay(case: Case, steps: int, device: torch.device
         )
         state = sim(state)
         u = H * state.velocities[0].cpu().numpy()
-        scale = float(np.linalg.norm(problem.residual(problem.course())))
+        scale = float(np.linalg.norm(problem.residual(problem.unsolved())))
         assert np.linalg.norm(problem.residual(u)) <= 1e-8 * scale
         assert np.abs(problem.align(u) - u).max() <= 1e-12
 
@@ -385,8 +385,8 @@ def test_nothing_moves_once_iterations_have_converged(case: Case) -> None:
     for _ in range(3):
         problem = step_problem(case.scene.values(), x, v, H)
         still = Still(**{name.name: getattr(problem, name.name) for name in fields(problem)})
-        solved = guarded_chebyshev(still, still.course(), iterations=800).displacement
-        assert np.linalg.norm(problem.residual(solved)) <= 1e-9 * np.linalg.norm(problem.residual(problem.course()))
+        solved = guarded_chebyshev(still, still.unsolved(), iterations=800).displacement
+        assert np.linalg.norm(problem.residual(solved)) <= 1e-9 * np.linalg.norm(problem.residual(problem.unsolved()))
         assert np.abs(problem.align(solved) - solved).max() <= 1e-9
         x, v = x + solved, solved / H
 

@@ -26,7 +26,7 @@ from torchpd.plan.compiled import CompiledScene
 from torchpd.plan.kernel_choice import choose_plan
 from torchpd.plan.kernel_costs import iteration_microseconds
 from torchpd.simulation import settings
-from torchpd.study.scenes import SUBJECTS
+from torchpd.study.scenes import STUDY_SCENES
 
 
 def beam(youngs: float, cells: int = 5, **options: Any) -> pd.Simulator:
@@ -231,8 +231,8 @@ def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch:
     """Of the measured steps of 16 beams on a GPU, with the costs of one: the choice itself is the same on the CPU."""
     file = ROOT / "benchmarks" / "results" / "time-to-error-cuda-batch-16.json"
     rows = [row for row in json.loads(file.read_text())["rows"] if row["size"] == size]
-    subject = SUBJECTS["beam"]()
-    mesh = subject.mesh({"1k": 5, "3k": 8, "10k": 12}[size])
+    studied = STUDY_SCENES["beam"]()
+    mesh = studied.mesh({"1k": 5, "3k": 8, "10k": 12}[size])
 
     def chebyshev_time(compiled: CompiledScene, batch: int) -> float:
         plan = choose_plan(compiled.scene.values(), compiled.dtype, H100, batch=batch, progress=False)
@@ -245,8 +245,8 @@ def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch:
     monkeypatch.setattr(automatic, "_multilevel_time", multilevel_time)
     chosen = []
     for row in rows:
-        scene = subject.scene(mesh, row["youngs"])
-        sim = pd.Simulator(scene, subject.time_step, solver="auto", batch=row["batch"], progress=False)
+        scene = studied.scene(mesh, row["youngs"])
+        sim = pd.Simulator(scene, studied.time_step, solver="auto", batch=row["batch"], progress=False)
         took = [row["solvers"][name]["milliseconds"]["min"] for name in ("Chebyshev", "Multilevel")]
         assert took[isinstance(sim.solver, pd.Multilevel)] <= 1.1 * min(took), row["youngs"]
         chosen.append(type(sim.solver))
@@ -255,7 +255,7 @@ def test_few_environments_get_the_solver_that_was_faster(size: str, monkeypatch:
     assert chosen[-1] is pd.Multilevel
     # alone they get Chebyshev where sixteen get Multilevel
     if size == "1k":
-        alone = pd.Simulator(subject.scene(mesh, 1e6), subject.time_step, solver="auto", batch=1, progress=False)
+        alone = pd.Simulator(studied.scene(mesh, 1e6), studied.time_step, solver="auto", batch=1, progress=False)
         assert isinstance(alone.solver, pd.Chebyshev)
         assert chosen[2] is pd.Multilevel
 

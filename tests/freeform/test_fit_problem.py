@@ -101,7 +101,7 @@ def test_no_radius_leaves_its_bounds() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1.0, 1.0, (500, 3))
     case = HeightProblem(points, np.ones(500), np.ones(500))
-    start = QuadricNumbers.balls(np.zeros((1, 3)), np.array([0.4]), np.array([0.5]))
+    start = QuadricNumbers.spheres(np.zeros((1, 3)), np.array([0.4]), np.array([0.5]))
     found = levenberg_marquardt(case, ridge_amplitudes(case, start), iterations=30, least=0.1)
     radii = 1.0 / np.linalg.svd(fit_problem.triangular(found.rows), compute_uv=False)
     assert radii.max() == pytest.approx(0.5, rel=1e-9)

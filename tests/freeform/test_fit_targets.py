@@ -11,7 +11,7 @@ import trimesh
 from patch_cases import ball, sheet
 
 import torchpd as pd
-from torchpd.freeform.targets import CloudTarget, FieldTarget, MeshTarget, along, project, target_of
+from torchpd.freeform.targets import CloudTarget, FieldTarget, MeshTarget, intersect_lines, project, target_of
 
 BOX = [[-1.5] * 3, [1.5] * 3]
 
@@ -44,7 +44,7 @@ def test_rays_meet_a_sphere_where_they_should() -> None:
     start = 0.9 * rng.standard_normal((50, 3))
     start /= 1.2 * np.linalg.norm(start, axis=1, keepdims=True)
     ways = start + 0.2 * rng.standard_normal((50, 3))
-    t, normals, found = along(FieldTarget(lambda x: x.norm(dim=1) - 1.0, BOX), start, ways, np.full(50, 2.0))
+    t, normals, found = intersect_lines(FieldTarget(lambda x: x.norm(dim=1) - 1.0, BOX), start, ways, np.full(50, 2.0))
     b, c = (start * ways).sum(1), (start**2).sum(1) - 1.0
     a = (ways**2).sum(1)
     assert found.mean() > 0.9
@@ -57,7 +57,7 @@ def test_rays_that_leave_out_of_reach_or_the_wrong_way() -> None:
     target = MeshTarget(cube())
     start = np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 1.1]])
     ways = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    t, _, found = along(target, start, ways, np.array([1.0, 0.4, 1.0]))
+    t, _, found = intersect_lines(target, start, ways, np.array([1.0, 0.4, 1.0]))
     np.testing.assert_array_equal(found, [True, False, False])
     assert t[0] == pytest.approx(0.5)
 

@@ -299,5 +299,5 @@ def test_other_refusals() -> None:
         ops.patch_deformation(*args, **{**options, "lower": 0.0})
     gradients, areas, lists = arguments("frames", ("flat", "base"), F64, torch.device("cpu"))[0]
     mapped = [torch.stack([t, t]) for t in lists]
-    with pytest.raises(ValueError, match="the lists of patches cannot be mapped by vmap"):
+    with pytest.raises(ValueError, match=r"lists of patches.*vmap"):
         torch.func.vmap(ops.patch_frames, in_dims=(None, None, [0] * 11))(gradients, areas, mapped)

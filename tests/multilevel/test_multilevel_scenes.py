@@ -103,7 +103,7 @@ def test_springs_that_it_does_not_know_leave_it_positive() -> None:
 
     stiff = scene(1e8)
     ready = simulator(stiff, torch.float64, solver=pd.Multilevel(), iterations=600)
-    solution, first = displacement(ready, ready(state_of(stiff, ready))), stiff.problem().course()
+    solution, first = displacement(ready, ready(state_of(stiff, ready))), stiff.problem().unsolved()
     sim = simulator(scene(1.0), torch.float64, solver=pd.Multilevel(), iterations=80)
     springs = torch.ones(9, len(sim.pin_stiffness), dtype=torch.float64)
     springs[4], springs[7] = 1e8, 1e-3
@@ -418,4 +418,4 @@ def test_vertices_far_from_others_in_size() -> None:
     u = sim(thrown).velocities[0].numpy() / 60
     problem = problem_of(sim, thrown)
     # of what x + h v leaves out of balance, which is far more than weighs on the bodies
-    assert np.linalg.norm(problem.residual(u)) <= 1e-4 * np.linalg.norm(problem.residual(problem.course()))
+    assert np.linalg.norm(problem.residual(u)) <= 1e-4 * np.linalg.norm(problem.residual(problem.unsolved()))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from torchpd.study.results_log import Ledger, Row, write_csv
+from torchpd.study.results_log import ResultsLog, Row, write_csv
 
 ROWS = [
     Row("solver", "a", iterations=3, error=0.5, milliseconds=1.5, more={"turn": 0.25}),
@@ -19,8 +19,8 @@ ROWS = [
 
 def test_finished_tasks_are_not_done_again(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
-    assert Ledger(path, {"youngs": 1.0}).rows_of("one", lambda: ROWS) == ROWS
-    again = Ledger(path, {"youngs": 1.0})
+    assert ResultsLog(path, {"youngs": 1.0}).rows_of("one", lambda: ROWS) == ROWS
+    again = ResultsLog(path, {"youngs": 1.0})
     assert again.has("one")
     assert not again.has("two")
     assert again.rows_of("one", lambda: pytest.fail("done again")) == ROWS
@@ -28,30 +28,30 @@ def test_finished_tasks_are_not_done_again(tmp_path: Path) -> None:
 
 def test_a_task_that_was_cut_off_is_done_again(tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
-    ledger = Ledger(path, {})
-    ledger.rows_of("one", lambda: ROWS)
-    ledger.rows_of("two", lambda: ROWS)
+    log = ResultsLog(path, {})
+    log.rows_of("one", lambda: ROWS)
+    log.rows_of("two", lambda: ROWS)
     path.write_text(path.read_text()[:-20])
-    again = Ledger(path, {})
+    again = ResultsLog(path, {})
     assert (again.has("one"), again.has("two")) == (True, False)
     again.rows_of("two", lambda: ROWS[:1])
     # the torn line is gone
-    assert Ledger(path, {}).rows_of("two", list) == ROWS[:1]
+    assert ResultsLog(path, {}).rows_of("two", list) == ROWS[:1]
 
 
 def test_a_failing_task_leaves_nothing_behind(tmp_path: Path) -> None:
-    ledger = Ledger(tmp_path / "rows.jsonl", {})
+    log = ResultsLog(tmp_path / "rows.jsonl", {})
     with pytest.raises(ZeroDivisionError):
-        ledger.rows_of("one", lambda: [Row("solver", "a", error=1 / 0)])
-    assert not Ledger(tmp_path / "rows.jsonl", {}).has("one")
+        log.rows_of("one", lambda: [Row("solver", "a", error=1 / 0)])
+    assert not ResultsLog(tmp_path / "rows.jsonl", {}).has("one")
 
 
 @pytest.mark.parametrize("text", ["", "no json\n", '{"settings": {"youngs": 2.0}}\n'])
 def test_a_file_of_another_study_is_refused(text: str, tmp_path: Path) -> None:
     path = tmp_path / "rows.jsonl"
     path.write_text(text)
-    with pytest.raises(ValueError, match="holds a study with other settings; take another --out"):
-        Ledger(path, {"youngs": 1.0})
+    with pytest.raises(ValueError, match=r"--out .*other settings"):
+        ResultsLog(path, {"youngs": 1.0})
     assert path.read_text() == text
 
 

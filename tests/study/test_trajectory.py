@@ -8,7 +8,7 @@ import torch
 
 from torchpd.study.bench import Bench, Setting
 from torchpd.study.results_log import Trajectory
-from torchpd.study.scenes import SUBJECTS
+from torchpd.study.scenes import STUDY_SCENES
 from torchpd.study.trajectory import compare_trajectories, first_turn, tolerance_rows, trajectory_rows
 
 TIME_STEP = 0.01  # s
@@ -48,7 +48,7 @@ def test_every_measure_is_what_it_says() -> None:
 
 def test_more_iterations_come_nearer_to_the_converged_motion() -> None:
     """And few are false softness: a solve that ends early has not yet felt the stiffness."""
-    bench = Bench(SUBJECTS["beam"](), torch.device("cpu"))
+    bench = Bench(STUDY_SCENES["beam"](), torch.device("cpu"))
     setting = Setting(1e5, 1 / 30, 2)
     few, more, most = trajectory_rows(bench, setting, [4, 16, 256], seconds=0.3)
     assert few.error > more.error > most.error

@@ -197,7 +197,5 @@ def test_films_make_their_folder(tmp_path: Path) -> None:
 
 def test_a_track_of_several_environments_is_told_to_choose(tmp_path: Path) -> None:
     frames, triangles = _motion(2)
-    with pytest.raises(
-        ValueError, match=r"got \[2, 1, 8, 3\], those of several environments; choose one: frames\[:, 0\]"
-    ):
+    with pytest.raises(ValueError, match=r"frames .*\[2, 1, 8, 3\].*frames\[:, 0\]"):
         write_surface(tmp_path / "b.glb", frames[:, None], triangles, frames_per_second=24.0)

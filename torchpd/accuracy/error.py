@@ -261,7 +261,7 @@ def settled_steps(
             return twin(wide, pushed, start=start)
 
         problems = [problem_of(sim, state, item, forces=forces) for item in range(len(wide.positions))]
-        first = torch.from_numpy(np.stack([problem.course() for problem in problems]))
+        first = torch.from_numpy(np.stack([problem.unsolved() for problem in problems]))
         after, moves = run(Multilevel(), _LEADING), [torch.inf * torch.ones(len(first), dtype=torch.float64)]
         for iterations in _SETTLING:
             before, after = after, run(Chebyshev(), iterations, after.positions)
@@ -293,7 +293,7 @@ class _Search:
         self.targets = _wide(targets) if isinstance(targets, Tensor) else _widened(targets)
         self.problems = [problem_of(sim, state, item, forces=forces, targets=targets) for item in range(len(state[0]))]
         self.firsts = [
-            problem.course() if start == "velocity" else problem.first_iterate(start) for problem in self.problems
+            problem.unsolved() if start == "velocity" else problem.first_iterate(start) for problem in self.problems
         ]
         near = [problem.first_iterate(start) for problem in self.problems]
         self.best: Tensor = torch.from_numpy(np.array(near))  # displacements [B, V, 3] m

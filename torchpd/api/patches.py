@@ -1,4 +1,4 @@
-"""Free-form patches as users have them: patches that fit themselves to targets and are written, and rays that draw."""
+"""The public class of free-form patches: surface, fit, tessellation and files; and the rays that render them."""
 
 from __future__ import annotations
 
@@ -26,20 +26,19 @@ __all__ = ["FreeFormPatches", "PatchFit", "PatchRays", "fit_patches"]
 class FreeFormPatches(PatchSurface):
     """A surface of free-form patches at rest.
 
-    With barycentric coordinates b, P(b) = sum_k b_k V_k and D(b) = sum_k b_k N_k, the surface is P + h D, of height
+    With barycentric coordinates b, P(b) = sum_k b_k V_k and D(b) = sum_k b_k N_k, the surface is P + h D. Its height is
     h = sum_i a_i [1 - |M_i (x - c_i)|^2]_+^3 over the quadrics whose ellipsoid touches the patch. `base="phong"` curves
-    P as Phong tessellation does (weight 3/4). `measured_at="base"` takes x = P; `"surface"` takes x = P + h D, the
-    published reading, an equation for h, of one solution while its right side rises with h by less than 1
+    P as Phong tessellation does (weight 3/4). `measured_at="base"` takes x = P. `"surface"` takes x = P + h D, the
+    published definition: an equation for h with one solution while its right side rises with h by less than 1
     (`steepness`).
 
-    Everything floating may require a gradient. Patches do not change: `with_quadrics` and `to` make others.
+    All floating-point inputs may require a gradient. Patches are immutable: `with_quadrics` and `to` make new ones.
 
     Args:
         vertices: V [V, 3] at rest [m].
         triangles: vertex numbers [P, 3], counter-clockwise seen from outside; each edge in at most two triangles.
-        quadrics: owned by the whole surface, in the same frame as the vertices; none when left out.
-        directors: N [V, 3] of unit length, the directions in which heights are measured; angle-weighted vertex normals
-            when left out.
+        quadrics: in the frame of the vertices, shared by the whole surface; default none.
+        directors: N [V, 3] of unit length, along which heights are measured; default angle-weighted vertex normals.
         base: "flat" triangles, or "phong".
         measured_at: "base" or "surface".
         thickness: tau, half the thickness of the solid that `field` describes [m].
@@ -52,29 +51,29 @@ class FreeFormPatches(PatchSurface):
 
     @classmethod
     def fit(cls, target: Any, quadrics: int = 60, **options: Any) -> PatchFit:
-        """Patches fitted to a surface, and how far they are from it; `options` are those of `torchpd.fit_patches`."""
+        """Fit patches to a surface, and report their error; `options` are those of `torchpd.fit_patches`."""
         return fit_patches(target, quadrics, **options)
 
     def tessellate(self, level: int) -> Tessellation:
-        """A triangle mesh with `level` segments along every edge, to be evaluated in any pose."""
+        """A triangle mesh with `level` segments along every edge, for evaluation in any pose."""
         return tessellate(self, level)
 
     def mesh(self, level: int, pose: PatchPose | None = None) -> TriMesh:
-        """The surface as triangles, at rest or in a pose of one environment, welded: as closed as the base."""
+        """The surface as triangles, at rest or in a pose of one environment, welded: closed wherever the base is."""
         return self.tessellate(level).mesh(pose)
 
     def save(self, path: str | Path) -> None:
-        """Write to one safetensors file; `load` reads it."""
+        """Write to one safetensors file, for `load`."""
         save_patches(self, path)
 
     @staticmethod
     def load(path: str | Path) -> FreeFormPatches:
-        """Read what `save` wrote, on the CPU."""
+        """Read a file written by `save`, on the CPU."""
         return load_patches(path, FreeFormPatches)
 
 
 class PatchFit(NamedTuple):
-    """What `FreeFormPatches.fit` gives."""
+    """Result of `FreeFormPatches.fit`: the patches and their error."""
 
     patches: FreeFormPatches
     report: FitReport
@@ -94,33 +93,33 @@ def fit_patches(
     dtype: torch.dtype = torch.float32,
     progress: bool = False,
 ) -> PatchFit:
-    """Patches fitted to a surface, and how far they are from it. The same bits on every run.
+    """Fit patches to a surface, and report their error. The same bits on every run.
 
-    The base lies with its vertices on the target and has the target's normals for directors; it does not move. Quadrics
-    then make up the difference, measured along the directors at samples inside of patches and on their edges.
+    The base has its vertices on the target and takes the target's normals as directors; it stays fixed. Quadrics
+    represent the remaining height, measured along the directors at samples inside the patches and on their edges.
 
-    "lm": half of the quadrics begin as balls where the difference is large, and Levenberg-Marquardt moves all their
-    numbers; the other half begins on what is left; those that contribute nothing begin again elsewhere or are left out.
-    "adam": all begin at once, and normals and creases between patches count beside distances (`PatchLoss`); its errors
-    in distance are larger.
+    "lm": half of the quadrics start as spheres where the residual is large, and Levenberg-Marquardt moves all their
+    parameters. The other half starts on the new residual. Quadrics without effect restart elsewhere or are removed.
+    "adam": all start at once, and normals and creases between patches count besides distances (`PatchLoss`). Its
+    distances are larger.
 
     Args:
-        target: a TriMesh or trimesh.Trimesh, oriented; points [N, 3] of a closed surface [m]; or a function that turns
-            points [N, 3] (float64) into values [N], differentiable by torch, negative inside: a signed distance.
-        quadrics: at most so many.
-        patches: at most so many triangles for the base, found by simplifying the target, or the base itself.
+        target: a TriMesh or trimesh.Trimesh, oriented; or points [N, 3] of a closed surface [m]; or a function from
+            points [N, 3] (float64) to signed distances [N], negative inside, differentiable by torch.
+        quadrics: most quadrics.
+        patches: most triangles of the base, found by simplifying the target; or the base itself.
         base: "flat" or "phong", as for `FreeFormPatches`.
         optimizer: "lm" or "adam".
-        iterations: of each stage, at most 60 when left out; of Adam in all, 500 when left out.
-        radius_cap: the largest half axis of a quadric, in mean edges of the patch where it begins. Small ones touch
+        iterations: most iterations of each stage (default 60); with Adam the total (default 500).
+        radius_cap: largest half axis of a quadric, in mean edges of the patch where it starts. Small quadrics touch
             fewer patches.
-        normals: of the points [N, 3], outwards; estimated from neighbours when left out.
-        bounds: for a function, a box [2, 3] around its surface [m]; not needed with a base of your own.
-        dtype: of the patches. The fit itself is in float64 on the CPU.
+        normals: outward normals of the points [N, 3]; default: estimated from neighbours.
+        bounds: for a function, a box [2, 3] around its surface [m]; not needed if you pass a base.
+        dtype: of the patches. The fit itself runs in float64 on the CPU.
         progress: show a progress bar.
 
     Raises:
-        ValueError: a target that is not an oriented surface, that encloses nothing, or that folds over the base.
+        ValueError: the target is not an oriented surface, encloses nothing, or folds over the base.
         ImportError: distances from a mesh need the package rtree.
     """
     count = check_whole("FreeFormPatches.fit: quadrics", quadrics, minimum=1)
@@ -153,21 +152,21 @@ def fit_patches(
 
 
 class PatchRays(SurfaceRays):
-    """Finds where rays hit free-form patches.
+    """Finds the first hits of rays on free-form patches.
 
-    Every patch is cut into `level` x `level` cells, which a tree of boxes holds; the boxes follow each pose. A cell
-    that a ray may meet is searched by Newton's method, from several places where the cell is seen edge-on. Both sides
-    of the surface are hit, and patches leave no gap along their edges. A ray within the plane of a flat patch may pass.
+    Every patch is cut into `level` x `level` cells, kept in a tree of boxes that follows each pose. Newton's method
+    searches every cell that a ray may hit, from several starts if the cell is seen edge-on. Both sides of the surface
+    are hit, and there is no gap between patches. A ray within the plane of a flat patch may miss it.
 
-    How far the surface bulges over a cell is measured at 12 points in it. That is an estimate, good where a cell is
-    smaller than the quadrics on it, which the default level sees to up to 32. With cells as long as the radii, one of
-    100,000 rays over a bumpy plane, half of them grazing, missed two crossings close to each other; of rays aimed at
-    bumps that are narrower than that and many times as high, one in two hundred passes.
+    The bulge of the surface over a cell is estimated at 12 points. The estimate is good where cells are smaller than
+    the quadrics on them, as the default level ensures up to 32. With cells as long as the radii, one of 100,000 rays
+    over a bumpy plane (half of them grazing) missed two crossings close to each other. Of rays aimed at bumps narrower
+    than that and many times as high, one in two hundred missed.
 
     Args:
-        patches: the surface. Others of the same triangles may be passed to each call, for instance in an optimisation.
-        level: cells along every edge; when left out, at least 4, and so many that no edge of a cell is longer than
-            half the radii of the quadrics.
+        patches: the surface. Each call may take another one with the same triangles, for example in an optimisation.
+        level: cells along every edge. Default: at least 4, and enough that no edge of a cell is longer than half the
+            radii of the quadrics.
     """
 
     def render(
@@ -179,5 +178,5 @@ class PatchRays(SurfaceRays):
         patches: PatchSurface | None = None,
         **options: Any,
     ) -> PatchImage:
-        """Pictures of the surface: see `torchpd.freeform.image.render_patches`, which takes the options."""
+        """Render the surface; `torchpd.freeform.image.render_patches` documents the options."""
         return render_patches(self, camera, size, pose, patches=patches, **options)

@@ -1,4 +1,4 @@
-"""The step of `reference`, float64 on the CPU, with the compiled local step of the library: what methods share."""
+"""The step of `reference` in float64 on the CPU with the compiled local step, shared by the baseline methods."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _ops = torch.ops.torchpd
 
 @dataclass(frozen=True)
 class CountedStep(StepProblem):
-    """A step that counts how often it was evaluated."""
+    """A step that counts its evaluations."""
 
     calls: list[int] = field(default_factory=lambda: [0])
 
@@ -34,14 +34,14 @@ class CountedStep(StepProblem):
 
 @dataclass(frozen=True)
 class CompiledStep(CountedStep):
-    """The same E and grad E to rounding: the elastic part from the ops, in torch's threads, the rest as it was.
+    """E and grad E of `StepProblem` to rounding, with the elastic part from the ops, on torch's threads.
 
-    Who asks for one of the two does not pay for the other: they are a pass over the elements each.
+    Energy and gradient are separate passes over the elements, each made only on request.
     """
 
     @cached_property
     def _elements(self) -> tuple[list[Tensor], list[Tensor]]:
-        """Material and plan."""
+        """Material and plan arrays."""
         plan = compile_plan(self.values, dtype=torch.float64, progress=False)
         return material_rows(material_of(self.values, torch.float64)), list(plan.arrays)
 

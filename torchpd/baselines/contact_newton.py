@@ -1,8 +1,8 @@
-"""Newton's method for a step with smooth contacts, in float64: to rounding, where the methods of first order creep.
+"""Newton's method for a step with frictionless contacts, float64: exact to rounding where first-order methods stagnate.
 
-Which vertices touch is guessed anew in every iteration, from where a projected step of the Jacobi iteration would end:
-those move within their surfaces only, all others freely. This is a semismooth Newton method for the fixed point of the
-iteration, quadratic once the guess is right. Source: Hintermueller, Ito and Kunisch 2003 (primal-dual active sets).
+Every iteration predicts the touching vertices from the end of a projected Jacobi step. Those vertices move within their
+contact surfaces, all others freely. The method is a semismooth Newton method for the fixed point of that iteration, and
+quadratic once the active set is right. Source: Hintermueller, Ito and Kunisch 2003 (primal-dual active sets).
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ __all__ = ["ContactNewton"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_INNER = 1000  # iterations of conjugate gradients, at most
-_LINEAR = 1e-3  # relative residual that they end at
-_SHORTEST = 2.0**-12  # of the line search
-_SWEEPS = 50  # over the contacts of a vertex
-_LEVEL = 1e-12  # of energies: what differs by less differs by rounding
+_INNER = 1000  # upper limit of iterations of conjugate gradients
+_LINEAR = 1e-3  # relative residual at which they stop
+_SHORTEST = 2.0**-12  # least step length of the line search
+_SWEEPS = 50  # sweeps over the contacts of a vertex
+_LEVEL = 1e-12  # relative difference of energies below which it is rounding
 
 
 @dataclass(frozen=True)
 class _Touching:
-    """What a displacement meets: n directions are left to it."""
+    """Active contacts of a displacement, which leave n free directions."""
 
     gradient: Array  # [V, 3] N
-    landing: Array  # [V, 3] m: the way of touching vertices onto their surfaces
+    landing: Array  # [V, 3] m: displacement of touching vertices onto their surfaces
     tangents: csr_array  # [3 V, n], orthonormal
-    bending: Array  # [V] N/m: force of a ball over its radius, by which its curvature softens the tangents
+    bending: Array  # [V] N/m: force of a sphere over its radius; its curvature softens the tangents by as much
 
     def project(self, vectors: Array) -> Array:
-        """What of vectors [V, 3] the contacts leave."""
+        """Project vectors [V, 3] onto the free directions."""
         return np.asarray(self.tangents @ (self.tangents.T @ vectors.reshape(-1))).reshape(-1, 3)
 
 
@@ -67,9 +67,9 @@ def _touching(problem: StepProblem, displacement: Array) -> _Touching:
 
 
 def _pushes(normals: Array, depths: Array) -> Array:
-    """How far each contact pushes each vertex [C, V] m for it to be out of all of them, by the shortest way (Hildreth).
+    """Least displacement [C, V] m by which each contact moves each vertex out of all contacts (Hildreth).
 
-    A contact that others keep a vertex out of does not push it.
+    A contact is inactive (0) for a vertex that other contacts already keep outside it.
     """
     pushes = np.zeros_like(depths)
     for _ in range(_SWEEPS if len(depths) > 1 else 1):
@@ -80,7 +80,7 @@ def _pushes(normals: Array, depths: Array) -> Array:
 
 
 def _tangents(held: Mask, normals: Array, gaps: Array, free: Mask) -> tuple[Array, csr_array]:
-    """The ways onto the surfaces of vertices that some contacts hold, and the directions that all of them leave."""
+    """Displacements [V, 3] m of held vertices onto their surfaces, and the free directions of all vertices."""
     landing = np.zeros((len(free), 3))
     rows, entries = [], []
     for vertex in np.flatnonzero(held.any(axis=0)):
@@ -99,11 +99,11 @@ def _tangents(held: Mask, normals: Array, gaps: Array, free: Mask) -> tuple[Arra
 
 
 class ContactNewton:
-    """Newton's method for one step, with contacts or without; its linear systems are solved by conjugate gradients.
+    """Newton's method for one step, with contacts or without; conjugate gradients solve its linear systems.
 
     Args:
-        problem: the step; friction is left out.
-        passes: a counter [1] that goes up with every product with the Hessian.
+        problem: the step; friction is ignored.
+        passes: a counter [1], incremented by every product with the Hessian.
     """
 
     def __init__(self, problem: StepProblem, passes: list[int] | None = None) -> None:
@@ -111,9 +111,9 @@ class ContactNewton:
         self.krylov = NewtonKrylov(problem, [0] if passes is None else passes)
 
     def step(self, displacement: Array) -> tuple[Array, bool]:
-        """From u [V, 3] m to the minimum of the quadratic of E around it, among what the contacts leave.
+        """Newton step [V, 3] m from u: to the minimum of the quadratic model of E under the active contacts.
 
-        False with a step that is some way down only: no minimum is there, or it was not reached.
+        Returns the step and True. With False the step only descends: there is no minimum, or it was not reached.
         """
         found = _touching(self.problem, displacement)
         here = torch.from_numpy(displacement)
@@ -139,7 +139,7 @@ class ContactNewton:
         return found.landing + way, False
 
     def minimise(self, displacement: Array, *, iterations: int = 50, observe: Observer | None = None) -> Array:
-        """Steps from u [V, 3] m while energy falls, and residuals once energies differ by rounding only."""
+        """Take steps from u [V, 3] m while the energy falls, or the residual once energies differ only by rounding."""
         u, energy = displacement, self.problem.energy(displacement)
         size = float(np.linalg.norm(self.problem.residual(u)))
         for k in range(iterations):
@@ -152,7 +152,7 @@ class ContactNewton:
         return u
 
     def _descend(self, u: Array, energy: float, size: float, way: Array) -> tuple[Array, float, float] | None:
-        """Backtracking; None without any descent."""
+        """Backtrack along `way`; None if no step descends."""
         length = 1.0
         while length >= _SHORTEST:
             trial = self.problem.project(u + length * way)

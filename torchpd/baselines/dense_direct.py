@@ -1,7 +1,7 @@
-"""Projective dynamics as it was first published, on a GPU: the global step solved exactly by a dense inverse.
+"""Projective dynamics as first published, on a GPU: a dense inverse solves the global step exactly.
 
-What a study on a GPU compares with, as `baselines` are on the CPU. The local step is the compiled one of the library,
-and all iterations are one CUDA graph, so that the host does not slow the method down.
+Studies on a GPU compare with it, as `baselines` are for the CPU. The local step is the compiled one of the library. One
+CUDA graph holds all iterations, so that the host does not slow the method down.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ __all__ = ["DENSE", "MOST_VERTICES", "DenseDirect"]
 
 Array = NDArray[np.float64]
 
-MOST_VERTICES = 8192  # whose inverse takes 0.5 GB in float64
+MOST_VERTICES = 8192  # their inverse takes 0.5 GB in float64
 _DELAY = 10
 
 
 class DenseDirect:
-    """u <- u_prev + omega (u - A^-1 grad E(u) - u_prev), from A^-1 as a matrix; omega = 1 is the plain iteration.
+    """Iterate u <- u_prev + omega (u - A^-1 grad E(u) - u_prev) with a dense A^-1; omega = 1 is the plain iteration.
 
-    Source: Bouaziz et al. 2014, with Wang's (2015) acceleration of it.
+    Source: Bouaziz et al. 2014, with the acceleration of Wang 2015.
 
     Args:
-        sim: of the scene, whose device and precision are those of the iterations.
-        problem: the step, of one environment.
+        sim: a simulator of the scene; its device and precision are those of the iterations.
+        problem: the step of one environment.
 
     Raises:
         ValueError: the scene has contacts, or more than `MOST_VERTICES` vertices.
@@ -44,14 +44,14 @@ class DenseDirect:
         refuse_contacts(problem)
         vertices, free = len(problem.free), np.flatnonzero(problem.free)
         if vertices > MOST_VERTICES:
-            raise ValueError(f"a dense inverse is for up to {MOST_VERTICES} vertices; this scene has {vertices}")
+            raise ValueError(f"vertices must be at most {MOST_VERTICES} for a dense inverse, got {vertices}")
 
         def here(array: Array) -> Tensor:
             return torch.as_tensor(array, dtype=sim.dtype, device=sim.device)
 
         matrix = torch.as_tensor(problem.matrix[free][:, free].toarray(), device=sim.device)
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(matrix)).to(sim.dtype)
-        # zero where vertices are held, so that an iteration is a few calls without a detour through the free ones
+        # rows of held vertices are zero, so that an iteration needs no gather of the free ones
         self._inverse = inverse.new_zeros((vertices, vertices))
         self._inverse[torch.from_numpy(free[:, None]), torch.from_numpy(free)] = inverse
         self._weight, self._target = here(problem.weight[:, None]), here(problem.target)
@@ -60,11 +60,11 @@ class DenseDirect:
 
     @property
     def bytes(self) -> int:
-        """Memory of the inverse."""
+        """Size of the inverse [bytes]."""
         return self._inverse.numel() * self._inverse.element_size()
 
     def iterate(self, first: Tensor, omegas: Sequence[float]) -> Tensor:
-        """u [V, 3] m after as many iterations as there are omegas, from `first`."""
+        """u [V, 3] m after one iteration per omega, from `first`."""
         before = current = first
         for omega in omegas:
             elastic = torch.ops.torchpd.gradient((self._positions + current)[None], self._material, self._plan)[0]
@@ -74,9 +74,9 @@ class DenseDirect:
         return current.clone()
 
     def recorded(self, first: Tensor, omegas: Sequence[float]) -> Callable[[], Tensor]:
-        """`iterate` to be called again and again, from what `first` then holds.
+        """A callable that repeats `iterate` from the current contents of `first`.
 
-        On a GPU it is one CUDA graph, whose result the next call overwrites.
+        On a GPU it replays one CUDA graph; the next call overwrites its result.
         """
         return _Recording(self, first, omegas) if first.device.type == "cuda" else partial(self.iterate, first, omegas)
 
@@ -85,10 +85,10 @@ class _Recording:
     """A CUDA graph of all iterations."""
 
     def __init__(self, method: DenseDirect, first: Tensor, omegas: Sequence[float]) -> None:
-        # the graph knows addresses only: what lies there has to live as long as it does
+        # the graph stores addresses only: these tensors must live as long as the graph
         self._alive = (method, first)
         with torch.cuda.device(first.device):
-            # what libraries allocate or load at a first call cannot be recorded; nor can what only omega = 1 leaves out
+            # a first call may allocate or load a library, and omega = 1 skips some calls: neither can be captured
             stream = torch.cuda.Stream()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
@@ -111,7 +111,7 @@ def _accelerated(problem: StepProblem, first: Array, iterations: int) -> list[fl
     return classic_omegas(two_stage_rho(problem, first, factorised(problem)), _DELAY, iterations)
 
 
-# the omegas of a step, from its first iterate
+# the omegas of a step, computed from its first iterate
 DENSE: dict[str, Callable[[StepProblem, Array, int], list[float]]] = {
     "direct global step, dense": _plain,
     "direct global step + Chebyshev, dense": _accelerated,

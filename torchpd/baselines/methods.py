@@ -1,12 +1,15 @@
-"""Methods of the literature on the step of `reference`, to compare the library with: float64, on the CPU.
+"""Published methods on the step of `reference`, for comparison with the library: float64, on the CPU.
 
-Iterations and errors of these are exact. Their local step is the compiled one of the library (`CompiledStep`) in as
-many threads, so that milliseconds compare methods. What is around it is `Baseline.parts`: SuperLU's triangular solves
-are compiled, but not tuned to a machine; what NumPy does vertex by vertex, colour by colour or element by element has
-costs of its own, and such milliseconds are upper bounds. The twins of compiled solvers, "..., NumPy", are NumPy
-throughout: "guarded Chebyshev, NumPy" beside "guarded Chebyshev" says what the language costs. Every method starts from
-the same iterate, and knows no contact unless it projects vertex by vertex (the Jacobi family) or works on active sets
-(Newton-PCG, smooth contacts).
+Iterations and errors of these methods are exact. Their local step is the compiled one of the library (`CompiledStep`)
+on the same number of threads, so that milliseconds compare methods. `Baseline.parts` names the rest of the code:
+
+- SuperLU's triangular solves are compiled, but not tuned to the machine.
+- NumPy loops over vertices, colours or elements add an overhead of their own: such milliseconds are upper bounds.
+- The twins of compiled solvers, "..., NumPy", are NumPy throughout. Compare "guarded Chebyshev, NumPy" with
+  "guarded Chebyshev" for the cost of the language.
+
+Every method starts from the same iterate. Contacts need a projection per vertex (the Jacobi family) or active sets
+(Newton-PCG, without friction).
 """
 
 from __future__ import annotations
@@ -56,7 +59,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Observer = Callable[[int, Array], None]
 Solve = Callable[[Array], Array]  # an approximate A^-1 on [V, 3]
-Run = Callable[[int, Observer], object]  # up to so many iterations, which the observer sees
+Run = Callable[[int, Observer], object]  # (iterations, observer): runs up to so many iterations
 
 _PCG_TOLERANCE = 1e-2  # |A d - r| / |r| of an inexact global step
 _LBFGS_PAIRS = 8
@@ -64,40 +67,44 @@ _LBFGS_PAIRS = 8
 
 @dataclass(frozen=True)
 class Baseline:
-    """A method: `prepare(problem, first)` does what is done once a step, and returns what iterates."""
+    """A method: `prepare(problem, first)` does the work once per step and returns the iteration."""
 
     prepare: Callable[[StepProblem, Array], Run]
-    contacts: bool = False  # knows planes and spheres
-    compiled_twin: str | None = None  # the contender that has the same iterates; its local step stays NumPy's
-    parts: str = "NumPy"  # what it runs in
-    iteration: str = "local step + global step"  # what one iteration is
+    contacts: bool = False  # supports planes and spheres
+    compiled_twin: str | None = None  # the compiled solver with the same iterates; this one runs in NumPy throughout
+    parts: str = "NumPy"  # languages and libraries it runs in
+    iteration: str = "local step + global step"  # work of one iteration
     few: bool = False  # ten or twenty iterations find the minimum to rounding
 
 
 @dataclass
 class Trace:
-    """What a run of a baseline went through, by iteration."""
+    """History of a baseline run, by iteration."""
 
-    setup_seconds: float  # colouring, factorisation, estimating rho
+    setup_seconds: float  # colouring, factorisation, estimate of rho
     displacements: dict[int, Array] = field(default_factory=dict)  # [V, 3] m
-    seconds: dict[int, float] = field(default_factory=dict)  # since the set-up, without what observing took
+    seconds: dict[int, float] = field(default_factory=dict)  # after the set-up, without the observer
     local_steps: dict[int, int] = field(default_factory=dict)  # evaluations of E and grad E, products with H
-    peak_bytes: int = 0  # that Python and NumPy held at once, when asked for
+    peak_bytes: int = 0  # largest allocation of Python and NumPy, if requested
 
     @property
     def last(self) -> int:
-        """The last iteration that was carried out."""
+        """The last iteration done."""
         return max(self.displacements)
 
 
 def refuse_contacts(problem: StepProblem) -> None:
-    """For methods that know none.
+    """Refuse a scene with contacts, for methods that do not support them.
 
     Raises:
         ValueError: the scene has planes or spheres.
     """
-    if len(problem.values.planes) or len(problem.values.spheres):
-        raise ValueError("this method knows no contacts; only the Jacobi family and Newton-PCG do")
+    planes, spheres = len(problem.values.planes), len(problem.values.spheres)
+    if planes or spheres:
+        raise ValueError(
+            f"scene must have no contacts for this method; got {planes} planes and {spheres} spheres: "
+            "use the Jacobi family or Newton-PCG"
+        )
 
 
 def run_baseline(
@@ -109,18 +116,18 @@ def run_baseline(
     memory: bool = False,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Trace:
-    """Iterate from `first`, keeping every iterate; BLAS has as many threads as torch.
+    """Iterate from `first` and keep every iterate; BLAS uses as many threads as torch.
 
     Args:
-        method: of `BASELINES`.
+        method: an entry of `BASELINES`.
         problem: the step.
         first: u_0 [V, 3] m.
-        iterations: at most; methods that find the minimum earlier stop there.
-        memory: watch allocations, which slows the run down; times of such a run are not to be used.
-        clock: gives seconds.
+        iterations: upper limit; a method that finds the minimum earlier stops there.
+        memory: trace allocations. This slows the run: do not use its times.
+        clock: returns seconds.
 
     Raises:
-        ValueError: the scene has contacts and the method knows none.
+        ValueError: the scene has contacts and the method does not support them.
     """
     if not method.contacts:
         refuse_contacts(problem)
@@ -130,7 +137,7 @@ def run_baseline(
         tracemalloc.start()
     try:
         with _blas_threads():
-            counted.evaluate(first)  # compiles the plan or assembles the operator: no method's own, and not timed
+            counted.evaluate(first)  # compiles the plan or assembles the operator: common to all methods, not timed
             begin = clock()
             run = method.prepare(counted, first)
             trace = Trace(clock() - begin, {0: first}, {0: 0.0}, {0: 0})
@@ -152,14 +159,14 @@ def run_baseline(
 
 
 def _blas_threads() -> AbstractContextManager[object]:
-    """As many for BLAS as torch has: processor time counts those that wait too."""
+    """Limit BLAS to the threads of torch: processor time also counts threads that wait."""
     threads = optional_module("threadpoolctl", "threadpoolctl", "studies", "study")
     limits: AbstractContextManager[object] = threads.threadpool_limits(torch.get_num_threads(), user_api="blas")
     return limits
 
 
 class _Stopwatch:
-    """Time that passes unless it is paused [s]."""
+    """Elapsed time [s] without the pauses."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock, self._begin, self.seconds = clock, clock(), 0.0
@@ -188,11 +195,11 @@ def _iterate(problem: StepProblem, first: Array, solve: Solve, omegas: list[floa
 
 
 def _ignore(iteration: int, displacement: Array) -> None:
-    """No observer."""
+    """An observer that does nothing."""
 
 
 def two_stage_rho(problem: StepProblem, first: Array, solve: Solve, *, iterations: int = 32, delay: int = 10) -> float:
-    """The paper's estimate for any splitting: |e^K| / |e^{K-1}| with e = grad E, then the best of trial runs.
+    """The source paper's estimate of rho for any splitting: |e^K| / |e^{K-1}| with e = grad E, refined by trial runs.
 
     Source: Vyatkin and Dolgovesov 2023; the same search as `torchpd.estimate_rho`.
     """
@@ -209,7 +216,7 @@ def two_stage_rho(problem: StepProblem, first: Array, solve: Solve, *, iteration
 
 
 def colour_vertices(matrix: csr_array) -> Index:
-    """A colour for every row, so that no two rows of a colour share an entry: greedy, largest degree first.
+    """A colour for every row; rows of one colour share no entry. Greedy, largest degree first.
 
     networkx gives the same colours in 30 times the time.
     """
@@ -224,8 +231,8 @@ def colour_vertices(matrix: csr_array) -> Index:
 class GaussSeidel:
     """One coloured Gauss-Seidel sweep of A d = r from d = 0: vertices of one colour at once (Fratarcangeli 2016).
 
-    `symmetric` sweeps back again, which makes the iteration matrix similar to a symmetric one with eigenvalues in
-    [0, 1): what the Chebyshev method asks for.
+    `symmetric` adds a backward sweep. The iteration matrix is then similar to a symmetric one with eigenvalues in
+    [0, 1), as the Chebyshev method requires.
     """
 
     def __init__(self, problem: StepProblem, *, symmetric: bool = False) -> None:
@@ -249,7 +256,7 @@ class GaussSeidel:
 
 
 def _conjugate_gradients(problem: StepProblem) -> Solve:
-    """A global step that is solved to 1e-2 by SciPy's CG with the diagonal, axis by axis."""
+    """An inexact global step: SciPy's CG with the diagonal preconditioner, to 1e-2, axis by axis."""
     free = np.flatnonzero(problem.free)
     matrix = csr_array(problem.matrix[free][:, free])
     inverse = diags_array(1.0 / matrix.diagonal())
@@ -264,7 +271,7 @@ def _conjugate_gradients(problem: StepProblem) -> Solve:
 
 
 def factorised(problem: StepProblem) -> Solve:
-    """The global step solved exactly with a sparse factorisation made once (SuperLU through SciPy)."""
+    """An exact global step: a sparse factorisation made once (SuperLU through SciPy)."""
     free = np.flatnonzero(problem.free)
     factor = splu(csc_array(problem.matrix[free][:, free]), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
 
@@ -317,20 +324,20 @@ def _newton(problem: StepProblem, first: Array) -> Run:
         try:
             newton(problem, first, iterations=iterations, observe=observe)
         except RuntimeError:
-            return  # fewer iterations than the minimum needs: what the study asks about
+            return  # stopped before the minimum, as intended: the study measures the error there
 
     return run
 
 
 def _newton_krylov(problem: StepProblem, first: Array) -> Run:
-    """On active sets where there are contacts."""
+    """Newton-PCG; with contacts, on active sets."""
     passes = problem.calls if isinstance(problem, CountedStep) else [0]
     planes, spheres = problem.values.planes, problem.values.spheres
     if not len(planes) and not len(spheres):
         method = NewtonKrylov(problem, passes)
         return lambda iterations, observe: method.minimise(first, iterations, observe)
     if (planes[:, PLANES["friction"]] > 0.0).any() or (spheres[:, SPHERES["friction"]] > 0.0).any():
-        raise ValueError("this method knows no friction; friction=0 makes contacts smooth")
+        raise ValueError("friction of planes and spheres must be 0 for Newton-PCG with M; set friction=0")
     sets = ContactNewton(problem, passes)
     return lambda iterations, observe: sets.minimise(first, iterations=iterations, observe=observe)
 
@@ -345,7 +352,7 @@ def _quasi_newton(problem: StepProblem, first: Array) -> Run:
 
 
 def _lbfgs(problem: StepProblem, first: Array) -> Run:
-    """SciPy's L-BFGS-B in the variables sqrt(D) u, which is the preconditioner of the Jacobi family."""
+    """SciPy's L-BFGS-B in the variables sqrt(D) u, which applies the preconditioner of the Jacobi family."""
     free = problem.free
     scale = np.sqrt(problem.plain_diagonal[free])[:, None]
 

@@ -1,8 +1,8 @@
-"""Inexact Newton with the preconditioner of `Multilevel`: conjugate gradients on the true Hessian, float64, on the CPU.
+"""Inexact Newton: conjugate gradients on the exact Hessian with the M of `Multilevel`; float64, on the CPU.
 
-What a second-order method gains over L-BFGS on the same M, for comparison: elements, Hessian products and M are the
-compiled ones, the vectors between them torch's. Sources: Dembo, Eisenstat and Steihaug 1982 (inexact Newton); Steihaug
-1983 (stop where the curvature is not positive).
+It measures the gain of a second-order method over L-BFGS with the same M. Elements, Hessian products and M are
+compiled; the vector operations between them are torch's. Sources: Dembo, Eisenstat and Steihaug 1982 (inexact Newton);
+Steihaug 1983 (stop at nonpositive curvature).
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ Array = NDArray[np.float64]
 Observer = Callable[[int, Array], None]
 
 _ops = torch.ops.torchpd
-_LOOSEST = 0.5  # relative residual that the first linear solves stop at; later ones at sqrt |g| / |g_0|
-_INNER = 200  # iterations of a linear solve, at most
-_SHORTEST = 2.0**-20  # of the line search
+_LOOSEST = 0.5  # relative residual at which the first linear solves stop; later ones at sqrt |g| / |g_0|
+_INNER = 200  # upper limit of iterations in a linear solve
+_SHORTEST = 2.0**-20  # least step length of the line search
 
 
 class NewtonKrylov:
-    """The step of `problem`, and its minimisation from a first iterate.
+    """Minimisation of the step `problem` from a first iterate.
 
     Args:
-        problem: without contacts.
-        passes: a counter [1] that goes up with every pass over the elements: E and grad E together, or one H p.
+        problem: a step without contacts.
+        passes: a counter [1], incremented by every pass over the elements: E and grad E together, or one H p.
     """
 
     def __init__(self, problem: StepProblem, passes: list[int]) -> None:
@@ -63,18 +63,18 @@ class NewtonKrylov:
         return float(energy), torch.where(self.free, gradient, 0.0)
 
     def product(self, u: Tensor, p: Tensor) -> Tensor:
-        """H(u) p, the derivative of the rotations in it."""
+        """H(u) p [V, 3] N, with the derivative of the rotations."""
         self.passes[0] += 1
         elastic = _ops.hessian_product((self.start + u)[None], p[None], self.material, self.elements)[0]
         return torch.where(self.free, self.weight * p + elastic, 0.0)
 
     def precondition(self, g: Tensor) -> Tensor:
-        """M g."""
+        """M g [V, 3] m."""
         out: Tensor = _ops.precondition(g[None], self.levels)[0]
         return out
 
     def direction(self, u: Tensor, gradient: Tensor, tolerance: float) -> Tensor:
-        """About -H^-1 grad E: what conjugate gradients have when the residual or the curvature ends them."""
+        """Approximate -H^-1 grad E [V, 3] m by conjugate gradients, ended by the residual or the curvature."""
         p = torch.zeros_like(u)
         residual, z = -gradient, self.precondition(-gradient)
         search, rho, goal = z, float((residual * z).sum()), tolerance * float(gradient.norm())
@@ -93,7 +93,7 @@ class NewtonKrylov:
         return p
 
     def minimise(self, first: Array, iterations: int, observe: Observer) -> None:
-        """Newton's iterations from `first` [V, 3] m until nothing falls any more; each is observed."""
+        """Run Newton's iterations from `first` [V, 3] m until no step descends; `observe` sees each."""
         u = torch.from_numpy(first.copy())
         energy, gradient = self.evaluate(u)
         largest = size = float(gradient.norm())
@@ -110,7 +110,7 @@ class NewtonKrylov:
             observe(k + 1, u.numpy())
 
     def _descend(self, u: Tensor, energy: float, gradient: Tensor, step: Tensor) -> tuple[Tensor, float, Tensor] | None:
-        """Backtracking on the energy, on |grad E| once energies differ by rounding only; None without any descent."""
+        """Backtrack on the energy, or on |grad E| once energies differ only by rounding; None if no step descends."""
         slope, size, length = float((step * gradient).sum()), float(gradient.norm()), 1.0
         while length >= _SHORTEST:
             trial = u + length * step

@@ -1,4 +1,4 @@
-"""The whole path in one command: a mesh is filled, dropped, stepped, drawn, and its error measured."""
+"""The demo: fills a mesh, drops it, simulates and renders it, and measures the solver's error."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 TIME_STEP = 1 / 60  # s
-DROP_HEIGHT = 0.25  # m under the lowest vertex
+DROP_HEIGHT = 0.25  # m below the lowest vertex
 _DRAWING = ("mitsuba", "PIL", "imageio_ffmpeg", "pxr", "matplotlib")
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What `python -m torchpd demo` takes."""
+    """Options of `python -m torchpd demo`."""
 
     mesh: Path | None = None  # surface or tetrahedral mesh; None takes shapes.octopus()
-    cells: int = 24  # of the lattice along the longest side; a tetrahedral mesh needs none
+    cells: int = 24  # lattice cells along the longest side; ignored for a tetrahedral mesh
     steps: int = 120  # of 1/60 s
     youngs: float = 3e4  # Pa
-    iterations: int = 64  # of a step
+    iterations: int = 64  # per step
     device: str = "cpu"
     out: Path = Path("out")
     quick: bool = False  # fewer and smaller pictures
 
 
 class _Pictures(NamedTuple):
-    """How the motion is drawn."""
+    """Settings of the pictures."""
 
     sheet_frames: int
     sheet_columns: int
@@ -61,7 +61,7 @@ class _Pictures(NamedTuple):
     sheet_samples: int
     film_size: tuple[int, int]
     film_samples: int
-    film_every: int  # steps from one picture of the film to the next
+    film_every: int  # steps between two pictures of the film
 
 
 _GOOD = _Pictures(12, 4, (480, 360), 9, (400, 300), 4, 2)
@@ -69,17 +69,17 @@ _QUICK = _Pictures(6, 3, (240, 180), 9, (160, 120), 4, 6)
 
 
 class _Motion(NamedTuple):
-    """What the simulation gave."""
+    """Result of the simulation."""
 
     start: State
     track: Track
-    seconds: float  # of wall time
-    frames: Array  # [1 + steps, n, 3] of the drawn surface, the start first
+    seconds: float  # wall time
+    frames: Array  # [1 + steps, n, 3] m of the drawn surface, the start first
     triangles: Index  # of the drawn surface
 
 
 def run_demo(options: DemoOptions) -> str:
-    """Write pictures, films and the convergence plot to `options.out`; the report to print."""
+    """Write pictures, films and the convergence plot to `options.out`; returns the report to print."""
     check_packages()
     device = find_device(options.device)
     name = options.mesh.name if options.mesh else "octopus"
@@ -97,11 +97,11 @@ def run_demo(options: DemoOptions) -> str:
 
 
 def check_packages() -> None:
-    """Say that something to draw with is missing, before the work and not after it."""
+    """Refuse missing drawing packages before the work, not after it."""
     missing = missing_packages(package for package in OPTIONAL if package.module in _DRAWING)
     if missing:
         names = ", ".join(package.pip_name for package in missing)
-        raise ModuleNotFoundError(f"the demo draws with {names}, not installed: pip install torchpd[demo]")
+        raise ModuleNotFoundError(f"demo needs {names}, not installed: pip install torchpd[demo]")
 
 
 def _load(path: Path | None) -> TetMesh | TriMesh:
@@ -111,9 +111,9 @@ def _load(path: Path | None) -> TetMesh | TriMesh:
 
 
 def _place(shape: TetMesh | TriMesh, cells: int) -> TetMesh:
-    """One metre long, tilted so that it lands on an edge and bends, its lowest vertex above the ground."""
+    """Scale to one metre, tilt so that the body lands on an edge and bends, and lift it above the ground."""
     low, high = shape.bounds
-    # about z, then x and, towards the camera, y
+    # about z, then x, then y (towards the camera)
     tilt = Rotation.from_euler("zxy", [25.0, 20.0, 25.0], degrees=True).as_matrix()
     placed = shape.translated(-(low + high) / 2.0).scaled(1.0 / float((high - low).max())).transformed(tilt)
     mesh = placed if isinstance(placed, TetMesh) else tetrahedralize(placed, cells=cells, progress=True)
@@ -125,30 +125,30 @@ def _simulate(sim: Simulator, mesh: TetMesh, steps: int) -> _Motion:
     sim.step_(State(*(part.clone() for part in start)))  # the first step also allocates its workspace
     begin = time.perf_counter()
     track = sim.rollout(start, steps, return_info=True, progress=True)
-    seconds = time.perf_counter() - begin  # reading the residuals below would wait for a GPU; the copy here does
+    seconds = time.perf_counter() - begin  # includes the wait for a GPU: the rollout ends with a copy
     positions = torch.cat([start.positions, track.positions[:, 0]]).double().cpu().numpy()
     if not np.isfinite(positions).all():
-        raise ValueError("the motion left the range of numbers; a larger Young's modulus may help (--youngs)")
+        raise ValueError("positions must stay finite, got inf or NaN in the motion; try a larger --youngs")
     if mesh.embedding is None:
         return _Motion(start, track, seconds, positions, mesh.boundary())
     return _Motion(start, track, seconds, mesh.embedding.apply(positions), mesh.embedding.surface.triangles)
 
 
-def _study(subject: str, sim: Simulator, motion: _Motion, hardest: int, options: DemoOptions) -> Path | None:
-    """The convergence plot of the step whose objective is highest: elastic energy and sudden braking together."""
+def _study(body_name: str, sim: Simulator, motion: _Motion, hardest: int, options: DemoOptions) -> Path | None:
+    """Plot the convergence in the step with the highest objective, where elastic and impact energy add up."""
     before = motion.start if hardest == 0 else motion.track.state(hardest - 1)
     try:
         curves = compare_solvers(sim, before, iterations=128 if options.quick else 256, progress=True)
     except SolvedAlreadyError:
         return None  # too few steps to reach the ground: the body only falls
-    title = f"{subject}, the step of highest energy (t = {hardest * TIME_STEP:.2f} s)"
+    title = f"{body_name}, the step of highest energy (t = {hardest * TIME_STEP:.2f} s)"
     return plot_convergence(curves, options.out / "convergence.png", title=title, mark=options.iterations)
 
 
 def _draw(motion: _Motion, hardest: int, out: Path, pictures: _Pictures) -> list[Path]:
-    """A picture after the hardest step at once, then contact sheet, moving surface and films."""
+    """Render the hardest step at once, then contact sheet, moving surface and films."""
     frames, triangles = motion.frames, motion.triangles
-    # the floor is drawn where the surface comes to lie: a lattice around it touches the ground a little earlier
+    # the floor is drawn at the lowest point of the surface: the lattice around it touches the ground a little earlier
     sheet_studio, film_studio = (
         Studio(frames, triangles, ground=None, size=size, samples=samples)
         for size, samples in (

@@ -1,6 +1,6 @@
-"""What this installation is made of and what is wrong with it: `python -m torchpd doctor`.
+"""Report of this installation and its problems: `python -m torchpd doctor`.
 
-Works without the compiled extension, because its absence is the first thing to find out.
+It works without the compiled extension, since a missing extension is the first problem to report.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ..version import __version__
 __all__ = ["notes", "problems", "report"]
 
 
-# a wrong argument of an op, which has to raise ValueError and say what came
+# an op with a wrong argument must raise ValueError with the value in the message
 _WRONG_CALL = """
 import torch, torchpd
 try:
@@ -44,7 +44,7 @@ def _load_build() -> tuple[Mapping[str, Any] | None, str]:
 
 
 def _version(package: Package) -> str:
-    # of what this process runs: the metadata of torch leave out which CUDA it was built for
+    # of this process: torch's metadata do not say for which CUDA it was built
     loaded = getattr(sys.modules.get(package.module), "__version__", None)
     if isinstance(loaded, str):
         return loaded
@@ -55,7 +55,7 @@ def _version(package: Package) -> str:
 
 
 def _devices() -> list[tuple[str, str]]:
-    """Every device that torch sees."""
+    """Every device visible to torch."""
     rows = [("cpu", f"{os.cpu_count()} logical cores, {torch.get_num_threads()} threads in use")]
     for index in range(torch.cuda.device_count()):
         device = torch.cuda.get_device_properties(index)
@@ -66,7 +66,7 @@ def _devices() -> list[tuple[str, str]]:
 
 
 def _driver() -> str:
-    """Release of the driver, asked of its own tool."""
+    """Version of the NVIDIA driver, from nvidia-smi."""
     command = ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"]
     try:
         said = subprocess.run(command, capture_output=True, text=True, check=True, timeout=20).stdout.split()
@@ -76,19 +76,19 @@ def _driver() -> str:
 
 
 def _cuda_state(build: Mapping[str, Any] | None, toolkit: Toolkit) -> str:
-    """What the extension has, and what building it now would give where that differs."""
+    """CUDA state of the extension, and of a build now if that differs."""
     built = build is not None and bool(build["cuda"])
     if built and toolkit.home is not None:
         return f"built; toolkit {toolkit.release} in {toolkit.home}"
     if built:
-        return f"built, but a build now would go without: {toolkit.reason}"
+        return f"built, but a build now would leave it out: {toolkit.reason}"
     if toolkit.home is not None:
         return f"not built, although toolkit {toolkit.release} in {toolkit.home} matches: rebuild with {BUILD_COMMAND}"
     return f"not built: {toolkit.reason}"
 
 
 def _call_wrongly() -> subprocess.CompletedProcess[str]:
-    """What a process does in which an op gets a wrong argument."""
+    """Run a process that calls an op with a wrong argument."""
     paths = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
     command = [sys.executable, "-c", _WRONG_CALL]
@@ -96,45 +96,45 @@ def _call_wrongly() -> subprocess.CompletedProcess[str]:
 
 
 def _problem_of_errors() -> str:
-    """Why an error of an op does not come back as an exception of Python; empty when it does."""
+    """The reason why an op's error does not arrive as a Python exception; empty if it does."""
     run = _call_wrongly()
     said = run.stdout.strip()
     if run.returncode == 0 and said.endswith(_END_OF_ERROR):
         return ""
     if run.returncode > 0 or (run.returncode == 0 and not said):
         last = " ".join(run.stderr.split())[-300:] or "nothing was raised"
-        return f"an op that gets a wrong argument does not raise ValueError: {last}"
+        return f"an op must raise ValueError for a wrong argument, got: {last}"
     names = {int(one): one.name for one in signal.Signals}
     crash = f"end the process by {names.get(-run.returncode, -run.returncode)} where they should raise an exception"
     return (
-        f"errors of ops {crash if run.returncode else f'are cut short ({said!r})'}: the extension has a C++ runtime of "
-        "its own, beside torch's. Take -static-libstdc++ out of CXX, CXXFLAGS and LDFLAGS, or name another compiler in "
+        f"errors of ops {crash if run.returncode else f'are cut short ({said!r})'}: the extension has its own C++ "
+        "runtime beside torch's. Remove -static-libstdc++ from CXX, CXXFLAGS and LDFLAGS, or name another compiler in "
         f"CXX, and build it again with {BUILD_COMMAND}"
     )
 
 
 def problems() -> list[str]:
-    """What keeps torchpd from working, each with its remedy; empty when all is well."""
+    """Problems that keep torchpd from working, each with its fix; empty if there are none."""
     found = [f"{package.pip_name} is missing: pip install {package.pip_name}" for package in missing_packages(REQUIRED)]
     build, reason = _load_build()
     if build is None:
         found.append(f"the extension torchpd._C cannot be loaded ({reason}): build it with {BUILD_COMMAND}")
     elif torch.cuda.is_available() and not build["cuda"]:
-        found.append(f"a GPU is there, but CUDA is {_cuda_state(build, find_toolkit())}")
+        found.append(f"a GPU is present, but CUDA is {_cuda_state(build, find_toolkit())}")
     if build is not None and (problem := _problem_of_errors()):
         found.append(problem)
     return found
 
 
 def notes() -> list[str]:
-    """What it does without, although it was built with it: a GPU."""
+    """Features that are built but unusable here: CUDA without a GPU."""
     build, _ = _load_build()
     if build is None or not build["cuda"]:
         return []
     count = torch.cuda.device_count()
     best = max((torch.cuda.get_device_capability(index) for index in range(count)), default=None)
     reason = unavailable_reason(True, torch.version.cuda, count, best).removesuffix(f"; {DOCTOR}")
-    return [f"CUDA is built, but there is no GPU to run on: {reason}"] if reason else []
+    return [f"CUDA is built, but no GPU is usable: {reason}"] if reason else []
 
 
 def _section(title: str, rows: Iterable[tuple[str, str]]) -> list[str]:

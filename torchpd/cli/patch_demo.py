@@ -1,4 +1,4 @@
-"""Bodies of free-form patches as large as the source paper's, in motion: simulated, tessellated, drawn and timed."""
+"""Free-form patch bodies of the source paper's size in motion: simulated, tessellated, rendered and timed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tqdm.auto import tqdm
 from ..api.patches import FreeFormPatches
 from ..api.simulator import Simulator
 from ..freeform.body import PatchBody
-from ..freeform.continuity import Seams, measure_seams
+from ..freeform.continuity import PatchContinuity, measure_continuity
 from ..freeform.quadrics import Quadrics
 from ..freeform.tessellation import tessellate
 from ..geometry.tri_mesh import TriMesh
@@ -28,14 +28,14 @@ from ..viewing.animation import write_surface
 from ..viewing.render import Picture, Studio, contact_sheet
 from .demo import TIME_STEP, DemoOptions, check_packages
 
-__all__ = ["PAPER_SCENES", "PatchScene", "PatchSubject", "run_patch_demo"]
+__all__ = ["PAPER_SCENES", "PatchScene", "PreparedScene", "run_patch_demo"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 
-class PatchSubject(NamedTuple):
-    """What is simulated, and where its grips are at the end of a step."""
+class PreparedScene(NamedTuple):
+    """A body in its scene, and the targets of its grips at the end of a step."""
 
     body: PatchBody
     scene: Scene
@@ -43,34 +43,34 @@ class PatchSubject(NamedTuple):
 
 
 class PatchScene(NamedTuple):
-    """As many patches and quadrics as a scene of Vyatkin and Dolgovesov (2023), and what a frame took on a GTX 470."""
+    """A scene with as many patches and quadrics as one of Vyatkin and Dolgovesov (2023), and its time on a GTX 470."""
 
     name: str
     patches: int
     quadrics: int
-    milliseconds: float  # of the paper
+    milliseconds: float  # per frame, of the paper
     frames_per_second: float  # of the paper
-    build: Callable[[int, float, int, torch.device], PatchSubject]  # quadrics, stiffness [Pa], steps
+    build: Callable[[int, float, int, torch.device], PreparedScene]  # quadrics, stiffness [Pa], steps
 
-    def subject(self, *, stiffness: float, steps: int, device: torch.device | str = "cpu") -> PatchSubject:
-        """The body and its scene; `stiffness` is st [Pa], and a motion goes on for `steps`."""
+    def prepare(self, *, stiffness: float, steps: int, device: torch.device | str = "cpu") -> PreparedScene:
+        """Build the body and its scene; `stiffness` is st [Pa], `steps` the length of the motion."""
         return self.build(self.quadrics, stiffness, steps, torch.device(device))
 
 
 class _Run(NamedTuple):
-    """What one scene gave."""
+    """Result of one scene."""
 
     scene: PatchScene
     body: PatchBody
-    seconds: tuple[float, float]  # simulation, surface; a frame
+    seconds: tuple[float, float]  # simulation and surface, per frame
     residual: float
-    seams: tuple[Seams, Seams]  # at rest and at the end
+    continuity: tuple[PatchContinuity, PatchContinuity]  # at rest and at the end
     frames: Array  # [1 + steps, n, 3]
     triangles: Index
 
 
 def spindle(rings: int, sectors: int, *, length: float, radius: float, power: float) -> TriMesh:
-    """A surface of revolution about x with 2 rings sectors triangles: a ball for power 2, a rounded bar for more."""
+    """A surface of revolution about x with 2 rings sectors triangles; power 2 is an ellipsoid, more flattens it."""
     along = (
         -np.cos(np.pi * np.arange(1, rings + 1) / (rings + 1)) if power <= 2 else np.linspace(-1, 1, rings + 2)[1:-1]
     )
@@ -83,7 +83,7 @@ def spindle(rings: int, sectors: int, *, length: float, radius: float, power: fl
     odd, after = ring % 2, (sector + 1) % sectors
     a, b = ring * sectors + sector, ring * sectors + after
     c, d = a + sectors, b + sectors
-    # rings are turned by half a sector against each other: the diagonal is the shorter one
+    # each ring is rotated by half a sector against the last: this makes the diagonal the shorter one
     first = np.where(odd[:, None], np.stack([a, d, b], 1), np.stack([a, c, b], 1))
     second = np.where(odd[:, None], np.stack([a, c, d], 1), np.stack([b, c, d], 1))
     start, end, last = rings * sectors, rings * sectors + 1, (rings - 1) * sectors
@@ -104,7 +104,7 @@ def sheet(columns: int, rows: int, *, length: float, width: float) -> TriMesh:
 
 
 def scattered(mesh: TriMesh, count: int, *, height: float, seed: int) -> Quadrics:
-    """Quadrics evenly at random over a surface, about an edge wide, bumps and dents up to `height` of their radius."""
+    """Random quadrics over a surface, about an edge wide; bumps and dents up to `height` of their radius."""
     rng = np.random.default_rng(seed)
     corners = mesh.vertices[mesh.triangles]
     edge = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
@@ -122,12 +122,12 @@ def _body(mesh: TriMesh, quadrics: Quadrics, device: torch.device, stiffness: fl
 
 
 def _turns(angle: float, axis: int) -> Array:
-    """The rotation about an axis."""
+    """The rotation by an angle about an axis."""
     return np.asarray(Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix())
 
 
 def _share(step: int, steps: int) -> float:
-    """From 0 to 1 over the first three quarters of the motion, then 1."""
+    """Fraction of the motion: 0 to 1 over the first three quarters of the steps, then 1."""
     return min(1.0, (step + 1) / (0.75 * steps))
 
 
@@ -136,8 +136,8 @@ def _held(body: PatchBody, mask: NDArray[np.bool_]) -> tuple[Pin, Array]:
     return pin, np.asarray(body.mesh.vertices[pin.vertices])
 
 
-def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PatchSubject:
-    """A flat, rounded bar, gripped at both ends, one of which makes half a turn."""
+def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PreparedScene:
+    """A flat, rounded bar, gripped at both ends; one grip makes half a turn."""
     mesh = spindle(30, 20, length=1.2, radius=0.2, power=8.0).scaled((1.0, 1.0, 0.4)).translated((0.0, 0.35, 0.0))
     body = _body(mesh, scattered(mesh, quadrics, height=0.2, seed=1), device, stiffness)
     x = body.mesh.vertices[:, 0]
@@ -148,11 +148,11 @@ def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) ->
         moved = (rest - middle) @ _turns(np.pi * _share(step, steps), 0).T + middle
         return {grip: torch.tensor(moved, dtype=torch.float32, device=device)}
 
-    return PatchSubject(body, Scene(body, wall, grip, Damping(2.0)), targets)
+    return PreparedScene(body, Scene(body, wall, grip, Damping(2.0)), targets)
 
 
-def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PatchSubject:
-    """A sheet whose far end is led along the arcs of constant curvature."""
+def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> PreparedScene:
+    """A sheet whose far end follows arcs of constant curvature."""
     length, most = 1.0, np.radians(150.0)
     mesh = sheet(25, 20, length=length, width=0.8)
     body = _body(mesh, scattered(mesh, quadrics, height=0.2, seed=2), device, stiffness, apex="prism", thickness=0.04)
@@ -165,14 +165,14 @@ def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> 
         moved = (rest - [length, 0.0, 0.0]) @ _turns(angle, 2).T + end
         return {grip: torch.tensor(moved, dtype=torch.float32, device=device)}
 
-    return PatchSubject(body, Scene(body, wall, grip, Damping(2.0)), targets)
+    return PreparedScene(body, Scene(body, wall, grip, Damping(2.0)), targets)
 
 
-def _drop(quadrics: int, stiffness: float, _steps: int, device: torch.device) -> PatchSubject:
-    """A ball that falls on the ground, a fifth as stiff as the others."""
+def _drop(quadrics: int, stiffness: float, _steps: int, device: torch.device) -> PreparedScene:
+    """A ball that falls on the ground, with a fifth of the others' stiffness."""
     mesh = spindle(10, 10, length=0.6, radius=0.3, power=2.0).transformed(_turns(0.9, 2)).translated((0.0, 0.75, 0.0))
     body = _body(mesh, scattered(mesh, quadrics, height=0.25, seed=3), device, 0.2 * stiffness)
-    return PatchSubject(body, Scene(body, Gravity(), Ground(friction=0.5)), None)
+    return PreparedScene(body, Scene(body, Gravity(), Ground(friction=0.5)), None)
 
 
 PAPER_SCENES = (
@@ -183,7 +183,7 @@ PAPER_SCENES = (
 
 
 def run_patch_demo(options: DemoOptions) -> str:
-    """Write a picture and moving surfaces of the three scenes to `options.out`; the report to print."""
+    """Write a picture and moving surfaces of the three scenes to `options.out`; returns the report to print."""
     check_packages()
     device = find_device(options.device)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -197,45 +197,45 @@ def run_patch_demo(options: DemoOptions) -> str:
 
 
 def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, level: int) -> _Run:
-    subject = scene.subject(stiffness=0.5 * options.youngs, steps=options.steps, device=device)
-    body = subject.body
-    sim = Simulator(subject.scene, TIME_STEP, options.iterations, batch=1).to(device)
+    prepared = scene.prepare(stiffness=0.5 * options.youngs, steps=options.steps, device=device)
+    body = prepared.body
+    sim = Simulator(prepared.scene, TIME_STEP, options.iterations, batch=1).to(device)
     start = sim.rest_state()
-    sim.rollout(start, 2, targets=subject.targets)  # the first steps also allocate their workspace
+    sim.rollout(start, 2, targets=prepared.targets)  # the first steps also allocate their workspace
     begin = _now(device)
-    track = sim.rollout(start, options.steps, targets=subject.targets, return_info=True, progress=True)
+    track = sim.rollout(start, options.steps, targets=prepared.targets, return_info=True, progress=True)
     simulated = _now(device) - begin
     positions = torch.cat([start.positions[None], track.positions])
     if not bool(positions.isfinite().all()):
-        raise ValueError("the motion left the range of numbers; a larger Young's modulus may help (--youngs)")
+        raise ValueError("positions must stay finite, got inf or NaN in the motion; try a larger --youngs")
     grid = tessellate(body.patches, level)
     with torch.no_grad():
-        heights = body.patches.heights(grid.samples)  # they belong to the material
+        heights = body.patches.heights(grid.samples)  # constant in the material
         body.patches.surface(grid.samples, body.pose(positions[0]), heights=heights)
         begin = _now(device)
         frames = [body.patches.surface(grid.samples, body.pose(x), heights=heights).points for x in positions]
         surfaced = _now(device) - begin
-        seams = measure_seams(body.patches), measure_seams(body.patches, body.pose(positions[-1]))
+        continuity = measure_continuity(body.patches), measure_continuity(body.patches, body.pose(positions[-1]))
     return _Run(
         scene,
         body,
         (simulated / options.steps, surfaced / len(positions)),
         float(track.info.residual.amax()),
-        seams,
+        continuity,
         torch.cat(frames).double().cpu().numpy(),
         grid.triangles.cpu().numpy(),
     )
 
 
 def _now(device: torch.device) -> float:
-    """Seconds, after the device has done what it was given."""
+    """Time [s] after the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter()
 
 
 def _draw(runs: list[_Run], options: DemoOptions) -> list[float]:
-    """One row of pictures for each scene; the seconds that a picture of each took."""
+    """Render one row of pictures per scene; returns the seconds per picture of each."""
     columns, size, samples = (3, (240, 180), 4) if options.quick else (4, (480, 360), 9)
     pictures: list[Picture] = []
     captions: list[str] = []
@@ -277,9 +277,9 @@ def _report(runs: list[_Run], options: DemoOptions, level: int, drawing: list[fl
         "across the edges of patches, at rest and at the end:",
     ]
     for run in runs:
-        rest, end = run.seams
+        rest, end = run.continuity
         lines.append(
-            f"  {run.scene.name}: gap {rest.gap:.1e}, {end.gap:.1e} m; crease mean {rest.mean:.1f}, {end.mean:.1f}, "
-            f"most {rest.most:.1f}, {end.most:.1f} degrees"
+            f"  {run.scene.name}: gap {rest.gap:.1e}, {end.gap:.1e} m; crease angle mean {rest.mean_angle:.1f}, "
+            f"{end.mean_angle:.1f}, largest {rest.largest_angle:.1f}, {end.largest_angle:.1f} degrees"
         )
     return "\n".join([*lines, "", "written:", *(f"  {file}" for file in files)])

@@ -1,7 +1,7 @@
-"""Which quadrics touch which patches, and the lists that gather values and gradients in a fixed order.
+"""Pairs of patches and quadrics that touch, and the lists that gather values and gradients in a fixed order.
 
-A quadric touches a patch when the ellipsoid reaches a place where the patch measures it: its triangle, or what may lie
-around it when the base is curved or the height is measured on the surface itself.
+A quadric touches a patch if its ellipsoid reaches a point where the patch may evaluate it. These points are the
+triangle; with a curved base, or with heights measured on the surface, its neighbourhood too.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = ["Touching", "corner_lists", "gather_lists", "touching", "triangle_distances"]
+__all__ = ["TouchingPairs", "corner_lists", "find_touching_pairs", "gather_lists", "triangle_distances"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-# Ellipsoids are taken this much larger, relative to their radii: float32 may round a sample into one that it misses.
+# ellipsoids are enlarged by this fraction of their radii: float32 rounding may move a sample into one that it misses
 _SLACK = 1e-6
 
 
 def triangle_distances(corners: Array) -> Array:
     """Distance of the origin from triangles [..., 3, 3].
 
-    The nearest point lies inside when its barycentric coordinates say so, else on the nearest of the three edges. A
-    triangle without area is its edges.
+    The nearest point is inside the triangle if its barycentric coordinates are positive, else on one of the edges. A
+    triangle without area counts as its edges.
     """
     a, b, c = (corners[..., k, :] for k in range(3))
     best = np.full(corners.shape[:-2], np.inf)
@@ -43,22 +43,22 @@ def triangle_distances(corners: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Touching:
-    """Pairs of patches and quadrics, ascending, and for each patch how far and how steeply its heights may reach."""
+class TouchingPairs:
+    """Pairs of patches and quadrics, ascending; and bounds of the height and steepness of each patch."""
 
     patch: Index  # [N]
     quadric: Index  # [N]
-    reach: Array  # [P] bound of |h| for heights that are measured on the surface, else 0 [m]
+    reach: Array  # [P] bound of |h| for heights measured on the surface, else 0 [m]
     steepness: Array  # [P] bound of the derivative of sum_i R_i(P + h D) by h there, else 0
 
 
 @dataclass(frozen=True)
 class _Base:
-    """What is asked of the patches, and how far their curved base lies from the triangle."""
+    """The triangles, and the distance of their curved base from them."""
 
     corners: Array  # [P, 3, 3]
     directors: Array  # [P, 3, 3], at the corners
-    lift: Array  # [P]
+    bulge: Array  # [P]
 
     @classmethod
     def of(cls, corners: Array, directors: Array, *, curved: bool) -> _Base:
@@ -72,22 +72,22 @@ class _Base:
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Pairs that may touch, in the metric in which each ellipsoid is the unit ball."""
+    """Candidate pairs, in the metric in which each ellipsoid is the unit ball."""
 
     patch: Index
     quadric: Index
-    distance: Array  # of the base surface from the centre, from below
+    distance: Array  # lower bound of the distance of the base surface from the centre
     stretch: Array  # bound of |M D|
-    along: Array  # [N, 2] bounds of M (P - c) . M D / |M D|, from below and from above
+    along: Array  # [N, 2] lower and upper bound of M (P - c) . M D / |M D|
 
 
 def _candidates(base: _Base, centres: Array, m: Array, slack: float) -> _Pairs:
-    """Pairs whose bounding balls meet when heights reach up to `slack`."""
+    """Pairs whose bounding balls meet for heights up to `slack`."""
     middle = base.corners.mean(axis=1)
     radius = np.linalg.norm(base.corners - middle[:, None], axis=2).max(axis=1)
     longest = np.linalg.norm(base.directors, axis=2).max(axis=1)
     reach = 1.0 / np.linalg.svd(m, compute_uv=False)[:, -1] if len(m) else np.empty(0)
-    around = float((radius + (base.lift + slack) * longest).max())
+    around = float((radius + (base.bulge + slack) * longest).max())
     found = cKDTree(middle).query_ball_point(centres, (1.0 + _SLACK) * reach + around) if len(m) else []
     quadric = np.repeat(np.arange(len(m)), [len(rows) for rows in found])
     patch = np.fromiter((row for rows in found for row in rows), dtype=np.int64, count=len(quadric))
@@ -96,8 +96,8 @@ def _candidates(base: _Base, centres: Array, m: Array, slack: float) -> _Pairs:
     corners = np.einsum("nij,nkj->nki", m[quadric], base.corners[patch] - centres[quadric][:, None])
     directors = np.einsum("nij,nkj->nki", m[quadric], base.directors[patch])
     stretch = np.linalg.norm(directors, axis=2).max(axis=1)
-    lift = base.lift[patch] * stretch
-    # M (P - c) . M D lies between its values for pairs of corners; |M D| is at least its part along the mean
+    lift = base.bulge[patch] * stretch
+    # M (P - c) . M D lies between its values for pairs of corners; |M D| is at least its component along the mean
     products = np.einsum("nji,nki->njk", corners, directors).reshape(-1, 9)
     mean = directors.sum(axis=1, keepdims=True)
     mean = mean / np.maximum(np.linalg.norm(mean, axis=2, keepdims=True), np.finfo(np.float64).tiny)
@@ -108,7 +108,7 @@ def _candidates(base: _Base, centres: Array, m: Array, slack: float) -> _Pairs:
 
 
 def _height_bounds(pairs: _Pairs, amplitudes: Array, patches: int) -> tuple[Array, Array]:
-    """Bounds [P] of h = sum_i R_i(P + h D): the least that contain what they imply.
+    """Bounds [P] of h = sum_i R_i(P + h D): the smallest interval that contains its own image.
 
     Within |h| <= H the quadric i is at least d_i - |M_i D| H away from the centre, d_i the distance of the base.
     """
@@ -126,10 +126,10 @@ def _height_bounds(pairs: _Pairs, amplitudes: Array, patches: int) -> tuple[Arra
 
 
 def _steepness(pairs: _Pairs, amplitudes: Array, low: Array, high: Array) -> Array:
-    """Bound of dR_i(P + h D)/dh for each pair, from above, while low <= h <= high.
+    """Upper bound of dR_i(P + h D)/dh for each pair, for low <= h <= high.
 
-    With u = M (P + h D - c) . M D / |M D| it is -6 a |M D| u [1 - u^2 - ..]^2: a bump is left on its far side, u > 0,
-    where it falls, and only what may lie on the near side counts; of a dent the other way round.
+    With u = M (P + h D - c) . M D / |M D| the derivative is -6 a |M D| u [1 - u^2 - ..]^2. A bump falls on its far side
+    (u > 0), so that only its near side counts; for a dent it is the opposite.
     """
     a = amplitudes[pairs.quadric]
     far_below = -(pairs.along[:, 0] + pairs.stretch * low[pairs.patch])
@@ -138,7 +138,7 @@ def _steepness(pairs: _Pairs, amplitudes: Array, low: Array, high: Array) -> Arr
     return np.asarray(6.0 * np.abs(a) * pairs.stretch * u * (1.0 - u**2) ** 2)
 
 
-def touching(
+def find_touching_pairs(
     vertices: Array,
     triangles: Index,
     directors: Array,
@@ -148,10 +148,11 @@ def touching(
     *,
     curved: bool,
     on_surface: bool,
-) -> Touching:
-    """Every pair of a patch and a quadric that the patch can measure.
+) -> TouchingPairs:
+    """Every pair of a patch and a quadric that the patch may evaluate.
 
-    None that is farther away where heights are measured on a flat base; otherwise up to the bounds of lift and height.
+    With heights measured on a flat base only ellipsoids that reach the triangle count; otherwise the bounds of the
+    base's curvature and of the height enlarge the range.
     """
     count = len(triangles)
     base = _Base.of(vertices[triangles], directors[triangles], curved=curved)
@@ -170,7 +171,7 @@ def touching(
     if on_surface:
         slopes = _steepness(pairs, amplitudes, low, high) * kept
         steepness += np.bincount(pairs.patch, slopes, count)
-    return Touching(pairs.patch[kept], pairs.quadric[kept], reach, steepness)
+    return TouchingPairs(pairs.patch[kept], pairs.quadric[kept], reach, steepness)
 
 
 def _starts(rows: Index, count: int) -> Index:
@@ -178,13 +179,13 @@ def _starts(rows: Index, count: int) -> Index:
 
 
 def corner_lists(elements: Index, count: int) -> tuple[Index, Index]:
-    """For each of `count` vertices, where it begins and which corners (width * element + corner) are around it."""
+    """For each of `count` vertices, the start of its list and the corners (width * element + corner) around it."""
     flat = elements.reshape(-1)
     return _starts(flat, count), np.argsort(flat, kind="stable")
 
 
-def gather_lists(triangles: Index, vertices: int, pairs: Touching, quadrics: int) -> list[Index]:
-    """The first eight arrays of csrc/freeform/lists.def, in its order; the rest belongs to samples."""
+def gather_lists(triangles: Index, vertices: int, pairs: TouchingPairs, quadrics: int) -> list[Index]:
+    """The first eight arrays of csrc/freeform/lists.def, in its order; the others belong to samples."""
     return [
         triangles,
         _starts(pairs.patch, len(triangles)),

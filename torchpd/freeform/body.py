@@ -1,4 +1,4 @@
-"""A body of free-form patches: a `Solid` whose tetrahedra are the constraints of the patches, and the pose it gives."""
+"""A body of free-form patches: a `Solid` whose tetrahedra are the constraints of the patches, and its patch pose."""
 
 from __future__ import annotations
 
@@ -25,36 +25,37 @@ ApexKind: TypeAlias = Literal["skeleton", "prism"]
 
 
 class PatchBody(Solid):
-    """An elastic body that free-form patches bound; a part of a `Scene` like any other `Solid`.
+    """An elastic body bounded by free-form patches; a part of a `Scene` like any other `Solid`.
 
-    Energy per constraint of four vertices, with G = Ds Dm^-1 and R its nearest rotation: st v |G - R|^2, v its volume
-    at rest (Vyatkin and Dolgovesov 2023; st = w / 2 of `Solid`). The vertices of the body are those of the patches, in
-    their order, then the apexes: what is said of vertices 0..V-1 (pins, forces, targets) is said of the patches.
-    Contacts hold for these vertices, not for what quadrics raise above them.
+    The energy of a constraint of four vertices is st v |G - R|^2, with G = Ds Dm^-1, R its nearest rotation and v its
+    rest volume (Vyatkin and Dolgovesov 2023; st = w / 2 of `Solid`). The body's vertices are those of the patches, in
+    their order, then the apexes. So pins, forces and targets of vertices 0..V-1 apply to the patches. Contacts act on
+    these vertices, not on the heights that quadrics add.
 
-    "skeleton", for closed bodies: every patch and an apex inside. Apexes are shared by patches that see them, and the
-    space between is filled, so that the constraints resist bending and change of volume. "prism", for open sheets, or
-    for a shell without a filling: a second layer under the patches, three constraints a patch. The layer takes part in
-    contacts and in the mass. Being one element thick, it stretches as a plate of its thickness would, but bends less:
-    3.1 + 1.24 (c / thickness)^2 times less, where c is the leg of right-angled patches. A stiffness smaller by as much
-    bends right and stretches too far. A thinner layer is no way out: at the same stretching it still resists bending
-    by 1.24 times what a plate of thickness c would.
+    "skeleton", for closed bodies: every patch has an apex inside. Patches that see an apex share it, and tetrahedra
+    fill the space between, so that the constraints resist bending and change of volume.
 
-    `Simulator.save` writes the Solid that it is; `patches.save` keeps the surface, which the same body is made of anew.
+    "prism", for open sheets or shells: a second layer under the patches, with three constraints per patch. It takes
+    part in contacts and in the mass. The layer is one element thick: it stretches like a plate of its thickness, but
+    resists bending 3.1 + 1.24 (c / thickness)^2 times more, with c the leg of right-angled patches. Dividing the
+    stiffness by that factor gives the right bending and too much stretch. A thinner layer does not help: at equal
+    stretching it still resists bending 1.24 times as much as a plate of thickness c.
+
+    `Simulator.save` writes the `Solid`; `patches.save` keeps the surface, from which you make the same body again.
 
     Args:
-        patches: at rest. Their shape and quadrics are constants of the body; `pose` works on their device and in
-            their precision, which are to be the simulator's.
-        stiffness: st [Pa], half of Young's modulus, a scalar or one value per patch, positive. What fills the space
-            between apexes takes the mean.
+        patches: at rest. Shape and quadrics are constants of the body. `pose` works on their device and in their
+            precision, which must be the simulator's.
+        stiffness: st [Pa], half of Young's modulus, a scalar or one value per patch, positive. Constraints between
+            apexes take the mean.
         density: [kg/m^3], positive. The mass is that of the enclosed volume, or of the layer.
         apex: "skeleton" or "prism".
-        thickness: of the layer of prisms along the directors [m], positive; half the mean edge when left out.
+        thickness: of the layer of prisms along the directors [m], positive; default half the mean edge.
         mode, stretch: of the frames, see `PatchTransport`.
 
     Raises:
-        ValueError: a skeleton for a surface that is open or inside out, or constraints that would be flat or inverted
-            (less than 1e-3 of the mean volume, or of their longest edge high).
+        ValueError: a skeleton for an open or inside-out surface, or flat or inverted constraints (less than 1e-3 of
+            the mean volume, or of their longest edge high).
     """
 
     patches: PatchSurface
@@ -87,7 +88,7 @@ class PatchBody(Solid):
         made = _constraints(patches, apex, thickness)
         own = made.patch >= 0
         st = np.where(own, constants[np.where(own, made.patch, 0)], constants.mean())
-        # overlaps and gaps between the constraints of a skeleton are no matter of mass
+        # constraints of a skeleton may overlap or leave gaps, which must not change the mass
         super().__init__(without_face_checks(made.points, made.tets), 2.0 * st, mass / made.share)
         rest = torch.as_tensor(made.points, dtype=patches.vertices.dtype, device=patches.vertices.device)
         set_frozen(
@@ -100,18 +101,18 @@ class PatchBody(Solid):
         set_frozen(self, transport=transport)
 
     def pose(self, positions: Tensor, fallback: Tensor | None = None) -> PatchPose:
-        """How the patches follow the body, for `patches.surface` and `patches.mesh`. Differentiable.
+        """The pose of the patches on the body, for `patches.surface` and `patches.mesh`. Differentiable.
 
         Args:
-            positions: of the vertices of this body [B, V + K, 3] [m]: those of a state, or with several bodies in the
-                scene `state.positions[:, scene.vertex_range(body)]`.
+            positions: vertices of this body [B, V + K, 3] [m]: those of a state, or with several bodies in the scene
+                `state.positions[:, scene.vertex_range(body)]`.
             fallback: see `PatchTransport.gradients`.
         """
         pose: PatchPose = self.transport(self.points(positions), fallback)
         return pose
 
     def points(self, positions: Tensor) -> Tensor:
-        """Vertices of the patches and their apexes, as `transport` takes them, from positions as for `pose`."""
+        """Patch vertices and apexes in the order of `transport`, from positions as for `pose`."""
         want = self.patches.vertices
         count = len(self.mesh.vertices)
         if not isinstance(positions, Tensor):
@@ -132,7 +133,7 @@ class PatchBody(Solid):
         return torch.cat([positions[:, : len(want)], self._apexes(positions)], dim=1)
 
     def _apexes(self, positions: Tensor) -> Tensor:
-        """What the frames take for apexes: those of the skeleton, or the middle of the layer under each patch."""
+        """The apexes of the frames: those of the skeleton, or the centroid of the layer under each patch."""
         rest = positions[:, len(self.patches.vertices) :]
         return rest if self._layer is None else self._layer(rest)
 
@@ -144,14 +145,14 @@ class PatchBody(Solid):
 
 
 class _Layer:
-    """Middles of the triangles of a layer, and the adjoint as a gather in a fixed order: the same bits every time."""
+    """Centroids of the triangles of a layer; the adjoint gathers in a fixed order, for equal bits."""
 
     def __init__(self, triangles: Tensor, vertices: int) -> None:
         corners = triangles.cpu().numpy().reshape(-1)
         order = np.argsort(corners, kind="stable")
         times = np.bincount(corners, minlength=vertices)
         rank = np.arange(len(order)) - np.repeat(np.cumsum(times) - times, times)
-        around = np.full((vertices, int(times.max())), len(triangles), dtype=np.int64)  # the row of zeros behind
+        around = np.full((vertices, int(times.max())), len(triangles), dtype=np.int64)  # default: an appended zero row
         around[corners[order], rank] = order // 3
         self.triangles = triangles.long()
         self.around = torch.as_tensor(around, device=triangles.device)

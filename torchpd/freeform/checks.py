@@ -1,4 +1,4 @@
-"""What the base of free-form patches must fulfil, and its normals."""
+"""Checks of the base of free-form patches, and its normals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ROUNDOFF = float(np.finfo(np.float64).eps)
 
 
 def check_surface(vertices: Tensor, triangles: Tensor) -> Index:
-    """The triangles as int64 [P, 3] of a surface that is fit to carry patches."""
+    """The triangles as int64 [P, 3], after checking that the surface can carry patches."""
     name = "FreeFormPatches.triangles"
     points = check_points("FreeFormPatches.vertices", vertices)
     elements = check_elements(name, triangles, 3, len(points))
@@ -25,7 +25,7 @@ def check_surface(vertices: Tensor, triangles: Tensor) -> Index:
     corners = points[elements]
     sides = corners[:, [1, 2, 0]] - corners
     area2 = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    # what rounding of the corners alone could make of a triangle without area
+    # the area that rounding of the corners alone could give a degenerate triangle
     longest = np.linalg.norm(sides, axis=2).max(axis=1)
     precision = float(torch.finfo(vertices.dtype).eps)
     noise = precision * (np.abs(points).max() + 2.0 * longest) * longest
@@ -36,7 +36,7 @@ def check_surface(vertices: Tensor, triangles: Tensor) -> Index:
 
 
 def _check_edges(name: str, elements: Index) -> None:
-    """Each edge once in each direction at most: an oriented surface, with or without a boundary."""
+    """Require each edge at most once in each direction: an oriented surface, with or without boundary."""
     directed = np.stack([elements, elements[:, [1, 2, 0]]], axis=2).reshape(-1, 2)
     count = int(elements.max()) + 1
     _, first, times = np.unique(np.sort(directed, axis=1) @ [count, 1], return_index=True, return_counts=True)
@@ -56,10 +56,10 @@ def _check_edges(name: str, elements: Index) -> None:
 
 
 def angle_weighted_normals(vertices: Tensor, elements: Index) -> Tensor:
-    """Unit normals of the vertices [V, 3]: normals of the triangles around, weighted by their angle there.
+    """Unit normals of the vertices [V, 3]: normals of the adjacent triangles, weighted by their angles.
 
-    Thuermer and Wuethrich (1998); independent of how the surface around a vertex is cut into triangles. In float64,
-    rounded to the precision of the vertices; no gradient.
+    Thuermer and Wuethrich (1998); independent of the triangulation around a vertex. Computed in float64, then rounded
+    to the precision of the vertices; no gradient.
     """
     points = vertices.detach().cpu().double().numpy()
     corners = points[elements]

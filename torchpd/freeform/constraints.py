@@ -1,7 +1,7 @@
-"""Constraints of four vertices for free-form patches: where the fourth vertex of every patch lies.
+"""Four-vertex constraints of free-form patches: placement of the fourth vertex of every patch.
 
-A constraint that a patch does not share with a neighbour resists stretching of the patch alone. Bending is resisted
-where neighbours share fourth vertices: points inside a closed body, or a second layer under a sheet.
+A constraint without neighbours resists only stretching of its patch. Bending resistance needs fourth vertices shared by
+neighbours: points inside a closed body, or a second layer under a sheet.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ __all__ = ["Constraints", "prisms", "skeleton"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-LEAST_VOLUME = 1e-3  # of the mean over patches, and least height over the longest edge: stiffness grows as 1 / v
-_LEAST_FILL = 1e-2  # the same for constraints between apexes, which nothing depends on one by one
-_VALENCE = 80  # patches that share an apex at most: one row of the diagonal solve gathers them all
-_SPARE = 1.25  # room for patches that do not see their nearest apex
+LEAST_VOLUME = 1e-3  # over the mean of the patches, and least height over the longest edge: stiffness grows as 1 / v
+_LEAST_FILL = 1e-2  # the same for constraints between apexes, none of which is necessary
+_VALENCE = 80  # most patches per apex: one row of the diagonal solve gathers them all
+_SPARE = 1.25  # spare room, for patches that do not see their nearest apex
 
 
 class Constraints(NamedTuple):
-    """What stands between the vertices of patches and the body that they bound."""
+    """Tetrahedra between the vertices of patches and the apexes of the body."""
 
     points: Array  # [V + K, 3] vertices of the patches, then apexes [m]
-    tets: Index  # [E, 4] of positive volume; of the skeleton, the first P are those of the patches
-    patch: Index  # [E] the patch that a constraint belongs to, -1 for what fills the space between apexes
+    tets: Index  # [E, 4] of positive volume; in a skeleton, the first P are those of the patches
+    patch: Index  # [E] patch of each constraint, -1 between apexes
     share: float  # sum of the volumes of the constraints / volume of the body
 
 
@@ -41,18 +41,18 @@ def volumes(points: Array, tets: Index) -> Array:
 
 
 def prisms(vertices: Array, triangles: Index, directors: Array, thickness: float) -> Constraints:
-    """A second layer at `thickness` under the patches, and three tetrahedra in each prism between the two.
+    """A second layer at distance `thickness` under the patches, with three tetrahedra per prism.
 
-    Each tetrahedron walks from layer to layer with rising vertex numbers, so that neighbours cut the quadrilateral
-    between them along the same diagonal.
+    The tetrahedra of a prism cross it in the order of vertex numbers, so that neighbours split their common
+    quadrilateral along the same diagonal.
     """
     count = len(vertices)
     points = np.concatenate([vertices, vertices - thickness * directors])
     a, b, c = np.sort(triangles, axis=1).T
     walks = [(a, b, c, c + count), (a, b, b + count, c + count), (a, a + count, b + count, c + count)]
     tets = np.stack([np.stack(walk, axis=1) for walk in walks], axis=1)
-    # the second layer lies behind triangles whose corners run counter-clockwise; along the walks the sign alternates,
-    # and it changes where sorting has reversed the triangle
+    # the second layer is behind counter-clockwise triangles: the sign alternates along the path, and flips where
+    # sorting has reversed the triangle
     ordered = np.stack([a, b, c], axis=1)
     forward = np.any([(np.roll(triangles, turn, axis=1) == ordered).all(axis=1) for turn in range(3)], axis=0)
     turned = forward[:, None] == np.array([True, False, True])
@@ -63,14 +63,14 @@ def prisms(vertices: Array, triangles: Index, directors: Array, thickness: float
 
 
 def skeleton(vertices: Array, triangles: Index) -> Constraints:
-    """Apexes inside a closed body, one tetrahedron for every patch, and some between apexes.
+    """Apexes inside a closed body, one tetrahedron per patch, and tetrahedra between apexes.
 
-    Apexes are means of clusters of points half way from the patches to the middle of the body. A patch takes the
-    nearest that it sees, or a point of its own under it. The space between them is filled along edges and around
-    vertices whose patches have different apexes, and between apexes by Delaunay.
+    Apexes are centroids of clusters of points half way from the patches to the centroid of the body. A patch takes the
+    nearest apex that it sees, or a point of its own under it. Tetrahedra fill the space along edges and around vertices
+    whose patches have different apexes, and between apexes (Delaunay).
     """
     corners = vertices[triangles]
-    body = float(np.linalg.det(corners).sum() / 6.0)  # by the divergence theorem
+    body = float(np.linalg.det(corners).sum() / 6.0)  # volume by the divergence theorem
     _check_closed(triangles, body)
     middle = corners.mean(axis=1)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -110,7 +110,7 @@ def _check_closed(triangles: Index, body: float) -> None:
 
 
 def _sides(triangles: Index) -> Index:
-    """The directed edges [3 P, 2]: all first sides, all second, all third."""
+    """The directed edges [3 P, 2]: all first sides, then all second, then all third."""
     return np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
 
 
@@ -127,7 +127,7 @@ def _refuse_flat(points: Array, tets: Index, patch: Index, fix: str) -> None:
 
 
 def _flatness(points: Array, tets: Index) -> Array:
-    """Least height of a tetrahedron over its longest edge [E]."""
+    """Least height of each tetrahedron over its longest edge [E]."""
     corners = points[tets]
     faces = [corners[:, [(k + j) % 4 for j in (1, 2, 3)]] for k in range(4)]
     area = np.max([np.linalg.norm(np.cross(f[:, 1] - f[:, 0], f[:, 2] - f[:, 0]), axis=1) for f in faces], axis=0)
@@ -136,7 +136,7 @@ def _flatness(points: Array, tets: Index) -> Array:
 
 
 def _clusters(points: Array, count: int, *, rounds: int = 30) -> Array:
-    """Means of clusters by k-means, begun from points far from one another: the same for the same input."""
+    """Centroids of k-means clusters, started from points far from one another; deterministic."""
     middle = points.mean(axis=0, keepdims=True)
     means = middle if count == 1 else points[[int(np.linalg.norm(points - middle, axis=1).argmax())]]
     for _ in range(1, count):
@@ -154,10 +154,10 @@ def _clusters(points: Array, count: int, *, rounds: int = 30) -> Array:
 
 
 def _nearest_seen(corners: Array, apexes: Array, *, least: float) -> Index:
-    """The apex of each patch [P], the nearest that it sees with room left; -1 where there is none.
+    """The nearest apex [P] that each patch sees and that has room left; -1 without one.
 
-    In rounds: every patch without an apex asks for the nearest that it has not asked for, and of those that see it
-    the nearest are accepted while there is room.
+    Works in rounds. Every patch without an apex asks for the nearest one not yet asked. Each apex accepts the nearest
+    patches that see it while it has room.
     """
     middle = corners.mean(axis=1)
     reach = np.linalg.norm(middle[:, None] - apexes, axis=2)
@@ -189,7 +189,7 @@ def _fill(points: Array, triangles: Index, apex: Index, corners: Array, mean: fl
     """Tetrahedra [F, 4] between apexes: over edges, around vertices, and among apexes that see one another."""
     sides = _sides(triangles)
     order = np.lexsort((sides.max(axis=1), sides.min(axis=1)))
-    left, right = order[0::2], order[1::2]  # closed: sides come in pairs
+    left, right = order[0::2], order[1::2]  # the surface is closed: sides come in pairs
     owner = np.tile(apex, 3)
     differ = owner[left] != owner[right]
     over = np.column_stack([sides[left], owner[left], owner[right]])[differ]
@@ -202,7 +202,7 @@ def _fill(points: Array, triangles: Index, apex: Index, corners: Array, mean: fl
 
 
 def _around_vertices(triangles: Index, apex: Index) -> Index:
-    """Where three apexes or more meet at a vertex: the vertex and neighbours among them, in order of their numbers."""
+    """Tetrahedra at vertices where three or more apexes meet: the vertex and neighbouring apexes, in their order."""
     pairs = np.unique(np.column_stack([triangles.reshape(-1), np.repeat(apex, 3)]), axis=0)
     starts = np.flatnonzero(np.diff(pairs[:, 0], prepend=-1))
     tets = [
@@ -214,13 +214,13 @@ def _around_vertices(triangles: Index, apex: Index) -> Index:
 
 
 def _among_apexes(points: Array, apexes: Index, corners: Array) -> Index:
-    """Delaunay tetrahedra of apexes, all six edges of which stay inside the body."""
+    """Delaunay tetrahedra of apexes whose six edges all stay inside the body."""
     none = np.zeros((0, 4), dtype=np.int64)
     if len(apexes) < 5:
         return apexes[None] if len(apexes) == 4 else none
     try:
         tets = apexes[Delaunay(points[apexes]).simplices.astype(np.int64)]
-    except QhullError:  # all in one plane
+    except QhullError:  # all apexes in one plane
         return none
     edges = tets[:, [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]].reshape(-1, 2)
     blocked = is_blocked(points[edges[:, 0]], points[edges[:, 1]], corners).reshape(-1, 6)

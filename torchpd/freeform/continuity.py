@@ -1,4 +1,4 @@
-"""What happens where free-form patches meet: the gap between them, and the crease that their normals show."""
+"""Continuity across the edges of free-form patches: the gap between neighbours, and the angle of their normals."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from numpy.typing import NDArray
 
 from .surface import PatchPose, PatchSurface
 
-__all__ = ["Seams", "measure_seams"]
+__all__ = ["PatchContinuity", "measure_continuity"]
 
 Index = NDArray[np.int64]
 
-_PLACES = (0.25, 0.5, 0.75)  # along an edge
+_POSITIONS = (0.25, 0.5, 0.75)  # along an edge
 
 
-class Seams(NamedTuple):
-    """Over the edges between two patches, in all environments; zeros without such an edge."""
+class PatchContinuity(NamedTuple):
+    """Continuity over all edges between two patches and all environments; zeros without such an edge."""
 
-    gap: float  # largest distance between the two sheets [m]
-    mean: float  # angle between their normals [degrees]
-    most: float  # largest such angle [degrees]
+    gap: float  # largest distance between the two surfaces [m]
+    mean_angle: float  # between their normals [degrees]
+    largest_angle: float  # between their normals [degrees]
 
 
-def measure_seams(patches: PatchSurface, pose: PatchPose | None = None) -> Seams:
-    """Compare both patches of every edge at three places along it, at rest or in a pose."""
+def measure_continuity(patches: PatchSurface, pose: PatchPose | None = None) -> PatchContinuity:
+    """Compare both patches of every edge at three points along it, at rest or in a pose."""
     triangles = patches.triangles.cpu().numpy().astype(np.int64)
     ends = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     order = np.lexsort((ends.max(axis=1), ends.min(axis=1)))
     key = np.sort(ends, axis=1)[order]
     paired = np.flatnonzero((key[1:] == key[:-1]).all(axis=1))
     if not len(paired):
-        return Seams(0.0, 0.0, 0.0)
-    # neighbours run along their edge in opposite directions
+        return PatchContinuity(0.0, 0.0, 0.0)
+    # the two patches traverse their edge in opposite directions
     one, other = _at(patches, order[paired], False, pose), _at(patches, order[paired + 1], True, pose)
     gap = (one[0] - other[0]).norm(dim=-1)
     sine, cosine = torch.linalg.cross(one[1], other[1]).norm(dim=-1), (one[1] * other[1]).sum(-1)
     angle = torch.rad2deg(torch.atan2(sine, cosine))
-    return Seams(float(gap.max()), float(angle.mean()), float(angle.max()))
+    return PatchContinuity(float(gap.max()), float(angle.mean()), float(angle.max()))
 
 
 def _at(
@@ -48,11 +48,11 @@ def _at(
     """Points and normals on sides 3 p + k of patches, which run from corner k to corner k + 1."""
     patch, corner = np.divmod(sides, 3)
     rows = np.arange(len(sides))
-    places = np.zeros((len(_PLACES), len(sides), 3))
-    for place, t in zip(places, _PLACES, strict=True):
+    places = np.zeros((len(_POSITIONS), len(sides), 3))
+    for place, t in zip(places, _POSITIONS, strict=True):
         place[rows, (corner + 1) % 3] = 1.0 - t if backwards else t
         place[rows, corner] = t if backwards else 1.0 - t
-    number = torch.as_tensor(np.tile(patch, len(_PLACES)), device=patches.vertices.device)
+    number = torch.as_tensor(np.tile(patch, len(_POSITIONS)), device=patches.vertices.device)
     samples = patches.samples(number, torch.as_tensor(places.reshape(-1, 3)).to(patches.vertices))
     with torch.no_grad():
         surface = patches.surface(samples, pose)

@@ -1,4 +1,4 @@
-"""Free-form patches fitted to a surface: a base of triangles on it, and quadrics that make up the difference."""
+"""Fit free-form patches to a surface: a triangle base on it, and quadrics for the remaining height."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ Surface = TypeVar("Surface", bound=PatchSurface)
 Array = NDArray[np.float64]
 Bar: TypeAlias = Callable[[], object]
 
-_LEAST_RADIUS = 1.5  # of a quadric, in spacings of the samples: what is smaller would hide between them
-_DEAD = 1e-6  # share of the heights' mean square below which a quadric contributes nothing
+_LEAST_RADIUS = 1.5  # of a quadric, in sample spacings: smaller ones would fall between samples
+_DEAD = 1e-6  # fraction of the heights' mean square below which a quadric has no effect
 _RESEEDS = 3
 
 
 @dataclass(frozen=True)
 class FitReport:
-    """How far patches are from what they were fitted to, at places between those of the fit, edges included.
+    """Error of patches against their target, at points between those of the fit, edges included.
 
-    Distances are those of the patches' surface from the target, not the other way round: parts of the target that the
-    base passes over do not show.
+    Distances are from the patches to the target, not the other way: parts of the target that the base skips do not
+    appear.
     """
 
-    rms: float  # distance, root of the mean square over the area [m]
+    rms: float  # distance, root mean square over the area [m]
     largest: float  # distance [m]
     normal_error: float  # mean angle between the normals of patches and target [degrees]
-    missed: float  # share of the fit's samples that found no target
-    size: float  # longest side of the box around the target [m]
+    missed: float  # fraction of the fit's samples without a target
+    size: float  # longest side of the target's bounding box [m]
     patches: int
     quadrics: int
     quadrics_per_patch: float  # mean number of quadrics that touch a patch
-    bytes: int  # float32 numbers: 5 a vertex (position, director), 10 a quadric; 3 indices a patch, of 2 bytes or 4
+    bytes: int  # float32: 5 per vertex (position, director), 10 per quadric; 3 indices per patch, of 2 or 4 bytes
 
     def __str__(self) -> str:
         return (
@@ -66,7 +66,7 @@ def fit_quadrics(
     dtype: torch.dtype,
     progress: bool,
 ) -> tuple[Surface, FitReport]:
-    """Patches without quadrics, in float64 on the CPU, with `count` quadrics that bring them to a target."""
+    """Add `count` quadrics that fit patches without quadrics, in float64 on the CPU, to a target."""
     level = sampling_level(len(empty.triangles), count)
     samples = sample_target(empty, target, level)
     stages = _Stages(empty, samples, radius_cap, level)
@@ -79,17 +79,17 @@ def fit_quadrics(
         loss = PatchLoss.from_samples(empty, samples, level)
         numbers = descend(loss, empty, seeds, iterations=iterations, least=stages.least, progress=progress)
     fitted = empty.with_quadrics(numbers.quadrics()).to(dtype)
-    fitted = fitted.with_quadrics(fitted.quadrics)  # lists of the rounded numbers
+    fitted = fitted.with_quadrics(fitted.quadrics)  # recomputes the lists from the rounded numbers
     return fitted, measure_fit(fitted, target, samples.missed)
 
 
 def sampling_level(patches: int, quadrics: int) -> int:
-    """Segments along an edge that give three to four samples for each unknown number."""
+    """Segments along an edge that give three to four samples per unknown."""
     return int(np.clip(np.ceil(np.sqrt(2.0 * 35.0 * quadrics / patches)), 5, 40))
 
 
 class _Stages:
-    """Quadrics placed where the residual is large, half of them first, the others on what is left."""
+    """Places quadrics where the residual is large: half of them first, the others on the new residual."""
 
     def __init__(self, empty: PatchSurface, samples: FitSamples, cap: float, level: int) -> None:
         self.problem = HeightProblem(samples.points, samples.heights, samples.areas * samples.cosines**2)
@@ -99,7 +99,7 @@ class _Stages:
         self.least = _LEAST_RADIUS * float(edges.mean()) / level
 
     def seed(self, count: int, residual: Array) -> QuadricNumbers:
-        """Balls around samples that have a large residual and are far from each other."""
+        """Spheres around samples with a large residual and far from each other."""
         points = self.samples.points
         weight = np.abs(residual) + 1e-3 * np.abs(residual).max(initial=0.0)
         apart = self.cap.copy()
@@ -109,10 +109,10 @@ class _Stages:
             chosen.append(place)
             apart = np.minimum(apart, np.linalg.norm(points - points[place], axis=1))
         cap = np.maximum(self.cap[chosen], 1.01 * self.least)
-        return QuadricNumbers.balls(points[chosen], 0.8 * cap, cap)
+        return QuadricNumbers.spheres(points[chosen], 0.8 * cap, cap)
 
     def solve(self, count: int, iterations: int, report: Bar) -> QuadricNumbers:
-        """Levenberg-Marquardt in two stages, and again while there are quadrics that contribute nothing."""
+        """Levenberg-Marquardt in two stages, repeated while some quadrics have no effect."""
         numbers = self.grow(None, count - count // 2, iterations, report)
         if count > 1:
             numbers = self.grow(numbers, count // 2, iterations, report)
@@ -144,7 +144,7 @@ class _Stages:
 
 
 def measure_fit(patches: PatchSurface, target: FitTarget, missed: float = 0.0, most: int = 20000) -> FitReport:
-    """How far patches are from a target, on a grid of places that no fit uses."""
+    """Measure the error of patches against a target, on a grid of points that no fit uses."""
     level = int(np.clip(np.sqrt(most / len(patches.triangles)), 3, 13))
     inner = inner_points(level)
     on_edge = np.array([[1.0 - t, t, 0.0] for t in (0.21, 0.5, 0.79)])
@@ -157,7 +157,7 @@ def measure_fit(patches: PatchSurface, target: FitTarget, missed: float = 0.0, m
     points, normals, tangents = (t.detach().cpu().double().numpy() for t in surface)
     distance, _, wanted = target.near(points)
     area = np.linalg.norm(np.cross(tangents[:, 0], tangents[:, 1]), axis=1)
-    # the middles of the level^2 triangles carry the area; places on edges count in the largest error
+    # the centroids of the level^2 triangles carry the area; points on edges count in the largest error
     carries = np.tile(np.arange(len(places)) < len(inner), count)
     weight = np.where(carries, area, 0.0) / area[carries].sum()
     cosine = np.clip((normals * wanted).sum(axis=1), -1.0, 1.0)

@@ -1,4 +1,4 @@
-"""Where a fit compares patches with their target: samples on every patch and its edges, and what they should have."""
+"""Samples of a fit on every patch and its edges, with the heights and normals of the target."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .surface import PatchSamples, PatchSurface
-from .targets import FitTarget, along
+from .targets import FitTarget, intersect_lines
 from .tessellation import grid, tessellate
 
 __all__ = ["FitSamples", "edge_pairs", "inner_points", "mean_edges", "sample_target"]
@@ -16,22 +16,22 @@ __all__ = ["FitSamples", "edge_pairs", "inner_points", "mean_edges", "sample_tar
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_REACH = 1.5  # of the mean edge of a patch: the target is not looked for further away
-_MISSED = 0.05  # share of samples that may find no target
+_REACH = 1.5  # search range for the target, in mean edges of a patch
+_MISSED = 0.05  # largest fraction of samples without a target
 
 
 @dataclass(frozen=True)
 class FitSamples:
-    """Samples that meet the target, edges and vertices once."""
+    """Samples on the target; those on edges and vertices occur once."""
 
     places: PatchSamples  # [S]
     points: Array  # P on the base [S, 3] [m]
     directors: Array  # D there, not of unit length [S, 3]
     heights: Array  # h* [S] [m]
     normals: Array  # of the target there [S, 3]
-    areas: Array  # of the base around each sample [S], adding up to 1
-    cosines: Array  # D . n* [S]: of a difference in height this share is distance
-    missed: float  # share of samples that found no target
+    areas: Array  # of the base around each sample [S], with sum 1
+    cosines: Array  # D . n* [S]: distance over difference in height
+    missed: float  # fraction of samples without a target
 
 
 def mean_edges(patches: PatchSurface) -> Array:
@@ -41,10 +41,10 @@ def mean_edges(patches: PatchSurface) -> Array:
 
 
 def sample_target(empty: PatchSurface, target: FitTarget, level: int) -> FitSamples:
-    """Samples with `level` segments along every edge of patches without quadrics, in float64 on the CPU.
+    """Sample patches without quadrics with `level` segments along every edge, in float64 on the CPU.
 
     Raises:
-        ValueError: on more than one sample in twenty the target does not lie along the director, or is turned away.
+        ValueError: for more than one sample in twenty the target is not along the director, or faces away.
     """
     grid_on = tessellate(empty, level)
     places = grid_on.samples
@@ -53,12 +53,12 @@ def sample_target(empty: PatchSurface, target: FitTarget, level: int) -> FitSamp
     corners = empty.triangles.long()[places.patch.long()]
     directors = (places.barycentrics[:, :, None] * empty.directors[corners]).sum(1).numpy()
     patch = places.patch.numpy()
-    heights, normals, found = along(target, points, directors, _REACH * mean_edges(empty)[patch])
+    heights, normals, found = intersect_lines(target, points, directors, _REACH * mean_edges(empty)[patch])
     if np.mean(~found) > _MISSED:
         first = int(np.flatnonzero(~found)[0])
         raise ValueError(
             "FreeFormPatches.fit: target must be a height over the base, along the directors, got none or one "
-            f"that is turned away at {int(np.sum(~found))} of {len(found)} samples, first on patch {patch[first]} near "
+            f"that faces away at {int(np.sum(~found))} of {len(found)} samples, first on patch {patch[first]} near "
             f"{points[first].round(4).tolist()}: it folds there; use more patches, or pass a base that follows it"
         )
     triangles = grid_on.triangles.numpy()
@@ -75,9 +75,9 @@ def sample_target(empty: PatchSurface, target: FitTarget, level: int) -> FitSamp
 
 
 def edge_pairs(triangles: Index, level: int) -> tuple[Index, Array]:
-    """Places on edges as both neighbours see them: patches [2, S], coordinates [2, S, 3].
+    """Points on shared edges as both neighbours see them: patches [2, S], coordinates [2, S, 3].
 
-    `level` - 1 of them inside of every edge that two patches share.
+    Every edge shared by two patches has `level` - 1 points inside.
     """
     sides = np.stack([triangles, triangles[:, [1, 2, 0]]], axis=2).reshape(-1, 2)
     _, number, times = np.unique(
@@ -90,7 +90,7 @@ def edge_pairs(triangles: Index, level: int) -> tuple[Index, Array]:
     for column in range(2):
         patch, k = np.divmod(order[:, column], 3)
         b = np.zeros((len(order), len(steps), 3))
-        # the second neighbour runs through the edge the other way
+        # the second neighbour traverses the edge in the other direction
         share = steps if column == 0 else 1.0 - steps
         np.put_along_axis(b, np.broadcast_to(k[:, None, None], (*b.shape[:2], 1)), 1.0 - share[:, None], axis=2)
         np.put_along_axis(b, np.broadcast_to(((k + 1) % 3)[:, None, None], (*b.shape[:2], 1)), share[:, None], axis=2)
@@ -100,6 +100,6 @@ def edge_pairs(triangles: Index, level: int) -> tuple[Index, Array]:
 
 
 def inner_points(level: int) -> Array:
-    """Coordinates [n, 3] strictly inside of a patch: the grid of `level` segments, shrunk to its triangles' middles."""
+    """Coordinates [n, 3] strictly inside a patch: the centroids of the triangles in a grid of `level` segments."""
     steps, triangles = grid(level)
     return np.asarray(steps[triangles].mean(axis=1) / level)

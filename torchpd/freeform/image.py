@@ -1,8 +1,8 @@
 """Pictures of free-form patches by rays: depth, normals, patch numbers and shaded colours, with gradients.
 
-A pixel shows what the ray through its middle hits. Gradients are those of what it shows, for the quadrics, the pose and
-the base (see `PatchRays.cast`). That a pixel shows the background or another part of the surface changes by jumps and
-has no gradient: outlines alone do not pull at the surface.
+A pixel shows the hit of the ray through its centre. Gradients are those of the hit, for the quadrics, the pose and the
+base (see `PatchRays.cast`). A switch of a pixel to the background or to another part of the surface is a jump without
+gradient. Outlines alone therefore do not move the surface.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Color = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class PatchImage:
-    """B pictures of H x W pixels. Background: not hit, infinite depth, zero normal, patch -1."""
+    """B pictures of H x W pixels. Background pixels: no hit, infinite depth, zero normal, patch -1."""
 
     hit: Tensor  # bool [B, H, W]
     depth: Tensor  # [B, H, W] m along the ray
@@ -51,20 +51,20 @@ def render_patches(
     light: Color | None = None,
     ambient: float = 0.2,
 ) -> PatchImage:
-    """Pictures of the surface in B poses, each from the same camera.
+    """Render the surface in B poses, each from the same camera.
 
-    Shading is Lambert's, for the side of the surface that is seen: color (ambient + (1 - ambient) [n . l]_+).
+    Shading is Lambert's, for the visible side of the surface: color (ambient + (1 - ambient) [n . l]_+).
 
     Args:
-        rays: of the surface.
+        rays: rays of the surface.
         camera: pinhole, see `torchpd.viewing.render.Camera`.
         size: width and height in pixels.
-        pose: of B environments; at rest, B = 1, when left out.
+        pose: of B environments; default at rest, B = 1.
         patches: as for `PatchRays.cast`.
         color: reflectance, linear RGB in 0..1.
         background: linear RGB.
-        light: direction towards a distant light; where the camera stands when left out.
-        ambient: share of the light that comes from everywhere, in 0..1.
+        light: direction towards a distant light; default: from the camera.
+        ambient: fraction of the light that comes from all directions, in 0..1.
     """
     _check_kinds(camera, size)
     width, height = size
@@ -91,7 +91,7 @@ def render_patches(
 
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
-    """Component by component: a sum over a dimension of three is slow."""
+    """Dot product by components: a sum over a dimension of three is slow."""
     (x, y, z), (u, v, w) = a.unbind(-1), b.unbind(-1)
     return x * u + y * v + z * w
 

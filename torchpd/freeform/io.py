@@ -1,4 +1,4 @@
-"""Free-form patches as files: one safetensors file, whose metadata says in JSON what the tensors mean."""
+"""Free-form patches as files: one safetensors file, with the meaning of its tensors as JSON in the metadata."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ __all__ = ["PATCHES_FORMAT_VERSION", "load_patches", "save_patches"]
 Surface = TypeVar("Surface", bound=PatchSurface)
 
 PATCHES_FORMAT_VERSION = 1
-_KEY = "torchpd.patches"  # of the metadata, beside which others may write theirs
+_KEY = "torchpd.patches"  # metadata key; others may add their own
 
 
 def save_patches(patches: PatchSurface, path: str | Path) -> None:
-    """Write base, quadrics and options; the lists are found again when the file is read."""
+    """Write base, quadrics and options; reading recomputes the lists."""
     target = check_target_file(path)
     quadrics = patches.quadrics
     tensors = {
@@ -42,13 +42,13 @@ def save_patches(patches: PatchSurface, path: str | Path) -> None:
         "measured_at": patches.measured_at,
         "thickness": patches.thickness,
     }
-    # clones, because tensors that share memory are refused
+    # safetensors refuses tensors that share memory: clone them
     values = {name: t.detach().cpu().contiguous().clone() for name, t in tensors.items()}
     save_file(values, target, metadata={_KEY: json.dumps(record)})
 
 
 def load_patches(path: str | Path, kind: type[Surface]) -> Surface:
-    """Read what `save_patches` wrote, on the CPU, as surfaces of a kind."""
+    """Read a file of `save_patches`, on the CPU, as an instance of `kind`."""
     file = Path(path)
     if not file.is_file():
         raise FileNotFoundError(f"no such file of patches: {file}")

@@ -1,8 +1,8 @@
-"""Heights at samples as a least-squares problem in the ten numbers of each quadric, by Levenberg-Marquardt.
+"""Least-squares fit of heights at samples in the ten parameters of each quadric, by Levenberg-Marquardt.
 
-With a base that stays where it is, heights depend on the places of the samples alone: h(x) = sum_i R_i(x). Each sample
-lies in a few quadrics, so the Jacobian is sparse. SciPy's least_squares knows no bounds of the radii: on the octopus it
-takes 5 to 60 times as long, and what it finds is 4 times worse once they hold.
+On a fixed base the heights depend only on the positions of the samples: h(x) = sum_i R_i(x). Each sample lies in a few
+quadrics, so the Jacobian is sparse. SciPy's least_squares has no bounds for the radii: on the octopus it takes 5 to 60
+times as long, and its result is 4 times worse once the bounds are applied.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ __all__ = ["HeightProblem", "QuadricNumbers", "levenberg_marquardt", "ridge_ampl
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_DENSE = 3000  # unknowns up to which the normal equations are solved as a dense matrix
+_DENSE = 3000  # most unknowns for which the normal equations are a dense matrix
 _ROWS, _COLUMNS = np.array([0, 1, 2, 1, 2, 2]), np.array([0, 1, 2, 0, 0, 1])  # entries of M in the order of `factors`
 
 
 @dataclass(frozen=True)
 class QuadricNumbers:
-    """Quadrics in rows [Q, 10]: a, c, and the six factors of `Quadrics`; and the largest radius of each [Q] [m]."""
+    """Parameters of quadrics in rows [Q, 10]: a, c, and the six `Quadrics.factors`; and their largest radii [Q] [m]."""
 
     rows: Array
     cap: Array
@@ -47,8 +47,8 @@ class QuadricNumbers:
         return Quadrics(rows[:, 0].clone(), rows[:, 1:4].clone(), rows[:, 4:].clone())
 
     @classmethod
-    def balls(cls, centres: Array, radii: Array, cap: Array) -> QuadricNumbers:
-        """Of amplitude 0."""
+    def spheres(cls, centres: Array, radii: Array, cap: Array) -> QuadricNumbers:
+        """Spheres with amplitude 0."""
         rows = np.zeros((len(centres), 10))
         rows[:, 1:4] = centres
         rows[:, 4:7] = -np.log(radii)[:, None]
@@ -56,20 +56,20 @@ class QuadricNumbers:
 
 
 def triangular(rows: Array) -> Array:
-    """M [Q, 3, 3]."""
+    """M [Q, 3, 3] in 1/m."""
     m = np.zeros((len(rows), 3, 3))
     m[:, _ROWS, _COLUMNS] = np.concatenate([np.exp(rows[:, 4:7]), rows[:, 7:10]], axis=1)
     return m
 
 
 def within_radii(numbers: QuadricNumbers, least: float) -> QuadricNumbers:
-    """The same with the half axes of every ellipsoid in [least, cap], as far as they were not."""
+    """The same quadrics with their half axes clamped to [least, cap]."""
     U, s, Vt = np.linalg.svd(triangular(numbers.rows))
     inside = np.clip(s, 1.0 / numbers.cap[:, None], 1.0 / least)
     changed = (inside != s).any(axis=1)
     if not changed.any():
         return numbers
-    # M^T M stays what it is when M is turned from the left: to lower triangular, by QR with both orders reversed
+    # M^T M does not change when M is rotated from the left: to lower triangular, by QR with both orders reversed
     m = ((U * inside[:, None, :]) @ Vt)[changed]
     upper = np.linalg.qr(m[:, ::-1, ::-1])[1]
     lower = upper[:, ::-1, ::-1]
@@ -86,13 +86,13 @@ class _Overlaps:
 
     sample: Index
     quadric: Index
-    apart: Array  # x - c [N, 3] [m]
+    offset: Array  # x - c [N, 3] [m]
     y: Array  # M (x - c) [N, 3]
     q: Array  # 1 - |y|^2 > 0 [N]
 
 
 class HeightProblem:
-    """sum_j w_j (h(x_j) - h*_j)^2, with heights and residuals weighted by sqrt(w).
+    """The objective sum_j w_j (h(x_j) - h*_j)^2; heights and residuals are weighted by sqrt(w).
 
     Args:
         points: x [S, 3] [m].
@@ -110,12 +110,12 @@ class HeightProblem:
         found = self.tree.query_ball_point(rows[:, 1:4], radius) if len(rows) else []
         quadric = np.repeat(np.arange(len(rows)), [len(f) for f in found])
         sample = np.concatenate([np.empty(0, np.int64), *(np.asarray(f, np.int64) for f in found)])
-        apart = self.points[sample] - rows[quadric, 1:4]
-        y = np.einsum("nij,nj->ni", m[quadric], apart)
+        offset = self.points[sample] - rows[quadric, 1:4]
+        y = np.einsum("nij,nj->ni", m[quadric], offset)
         q = 1.0 - (y**2).sum(axis=1)
         inside = np.flatnonzero(q > 0)
         order = inside[np.lexsort((quadric[inside], sample[inside]))]
-        return _Overlaps(sample[order], quadric[order], apart[order], y[order], q[order])
+        return _Overlaps(sample[order], quadric[order], offset[order], y[order], q[order])
 
     def residuals(self, rows: Array, pairs: _Overlaps | None = None) -> Array:
         pairs = self.overlaps(rows) if pairs is None else pairs
@@ -123,20 +123,20 @@ class HeightProblem:
         return np.asarray(self.root * (h - self.heights))
 
     def basis(self, rows: Array) -> csr_array:
-        """sqrt(w) [Q_i(x_j)]_+^3 [S, Q], by which amplitudes enter linearly."""
+        """The matrix sqrt(w) [Q_i(x_j)]_+^3 [S, Q] of the amplitudes, which enter linearly."""
         pairs = self.overlaps(rows)
         values = self.root[pairs.sample] * pairs.q**3
         return csr_array((values, (pairs.sample, pairs.quadric)), shape=(len(self.points), len(rows)))
 
     def linearised(self, rows: Array) -> tuple[Array, csr_array]:
-        """Residuals [S], and their derivatives by all numbers [S, 10 Q].
+        """Residuals [S], and their derivatives by all parameters [S, 10 Q].
 
         With q = 1 - |y|^2: dR/da = q^3, dR/dc = 6 a q^2 M^T y, dR/dM_ij = -6 a q^2 y_i (x - c)_j.
         """
         pairs = self.overlaps(rows)
         m = triangular(rows)[pairs.quadric]
         steep = 6.0 * rows[pairs.quadric, 0] * pairs.q**2
-        by_entry = -steep[:, None] * pairs.y[:, _ROWS] * pairs.apart[:, _COLUMNS]
+        by_entry = -steep[:, None] * pairs.y[:, _ROWS] * pairs.offset[:, _COLUMNS]
         by_entry[:, :3] *= m[:, [0, 1, 2], [0, 1, 2]]
         by_centre = steep[:, None] * np.einsum("nij,ni->nj", m, pairs.y)
         values = np.concatenate([(pairs.q**3)[:, None], by_centre, by_entry], axis=1)
@@ -148,7 +148,7 @@ class HeightProblem:
 
 
 def ridge_amplitudes(problem: HeightProblem, numbers: QuadricNumbers, ridge: float = 1e-4) -> QuadricNumbers:
-    """The same ellipsoids with the best amplitudes, held back by `ridge` times the mean of the diagonal."""
+    """The same ellipsoids with the best amplitudes, regularised by `ridge` times the mean of the diagonal."""
     A = problem.basis(numbers.rows)
     gram = (A.T @ A).toarray()
     gram[np.diag_indices_from(gram)] += ridge * max(np.trace(gram) / max(len(gram), 1), np.finfo(np.float64).tiny)
@@ -158,9 +158,9 @@ def ridge_amplitudes(problem: HeightProblem, numbers: QuadricNumbers, ridge: flo
 
 
 def _normal_matrix(J: csr_array) -> Array | csc_array:
-    """J^T J, as a sparse matrix when it is large.
+    """J^T J, sparse if it is large.
 
-    A sparse product costs about ten times as much for each number as a dense one, which counts zeros too.
+    A sparse product costs about ten times as much per entry as a dense one, which also counts zeros.
     """
     unknowns = J.shape[1]
     if unknowns > _DENSE:
@@ -175,7 +175,7 @@ def _normal_matrix(J: csr_array) -> Array | csc_array:
 
 
 def _damped_step(H: Array | csc_array, gradient: Array, damping: Array) -> Array | None:
-    """(H + damping)^-1 gradient, None when that is not positive definite."""
+    """(H + damping)^-1 gradient; None if the matrix is not positive definite."""
     if not isinstance(H, np.ndarray):
         solver = splu(csc_array(H + diags_array(damping)), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
         return np.asarray(solver.solve(gradient))
@@ -195,16 +195,16 @@ def levenberg_marquardt(
     least: float,
     report: Callable[[], object] = lambda: None,
 ) -> QuadricNumbers:
-    """Quadrics near these of a smaller sum of squares; each step stays within the radii.
+    """Improve quadrics to a smaller sum of squares; each step stays within the radii.
 
     Marquardt's scaling by the diagonal, Nielsen's rule for the damping (1999). Ends early when eight iterations gain
     less than 1e-3 of the sum.
 
     Args:
-        problem: to be solved.
-        numbers: to begin with.
-        iterations: at most so many linear systems.
-        least: radius [m].
+        problem: the least-squares problem.
+        numbers: the start.
+        iterations: most linear systems to solve.
+        least: smallest radius [m].
         report: called after each iteration.
     """
     numbers = within_radii(numbers, least)
@@ -216,7 +216,7 @@ def levenberg_marquardt(
     for _ in range(iterations):
         report()
         diagonal = H.diagonal()
-        # numbers without any influence are held by what the others have in the mean
+        # the mean of the diagonal regularises parameters without influence
         scale = np.maximum(diagonal, 1e-9 * max(float(diagonal.max(initial=0.0)), np.finfo(np.float64).tiny))
         step = _damped_step(H, gradient, damping * scale)
         if step is None:

@@ -1,4 +1,4 @@
-"""How far patches are from a target as a differentiable loss, for fits inside of training code."""
+"""Distance of patches from a target as a differentiable loss, for fits inside training code."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from .targets import target_of
 
 __all__ = ["PatchLoss", "descend"]
 
-_RELIST = 20  # iterations between searches for the patches that quadrics touch
+_RELIST = 20  # iterations between updates of the patches that quadrics touch
 
 
 class PatchLoss:
-    """Distances and normals of patches at fixed samples, beside those of a target, and creases between patches.
+    """Error of patches against a target at fixed samples: distances, normals, and creases between patches.
 
-    mean of ((S - S*) . n*)^2 / L^2 + w_n mean of |n - n*|^2 + w_e mean of |n_left - n_right|^2, with S* the point of
-    the target on the director, n* the normal there, and L the mean edge of the base [m]. The means of the first two are
-    over the area, that of the third over samples on edges. Small angles count squared, in radians. On the device and in
-    the precision of the patches that it was made for.
+    The loss is mean ((S - S*) . n*)^2 / L^2 + w_n mean |n - n*|^2 + w_e mean |n_left - n_right|^2. S* is the point of
+    the target on the director, n* its normal, and L the mean edge of the base [m]. The first two means are over the
+    area, the third over samples on edges. Small angles enter squared, in radians. Device and precision are those of the
+    patches.
 
     Args:
-        patches: of whose base the samples are; their quadrics do not matter.
-        target: as in `FreeFormPatches.fit`, with `normals` or `bounds` where that needs them.
-        level: segments along every edge of a patch between samples.
+        patches: patches whose base has the samples; their quadrics are ignored.
+        target: as in `FreeFormPatches.fit`, with `normals` or `bounds` if it needs them.
+        level: segments between samples along every edge of a patch.
         normal_weight: w_n, at least 0.
         edge_weight: w_e, at least 0.
 
     Raises:
-        ValueError: as `FreeFormPatches.fit` for targets that are no height over the base.
+        ValueError: as for `FreeFormPatches.fit`, if the target is not a height over the base.
     """
 
     targets: Tensor  # S* [S, 3]
-    wanted: Tensor  # n* [S, 3]
+    target_normals: Tensor  # n* [S, 3]
     areas: Tensor  # [S]
 
     def __init__(
@@ -63,7 +63,7 @@ class PatchLoss:
 
     @classmethod
     def from_samples(cls, patches: PatchSurface, samples: FitSamples, level: int) -> PatchLoss:
-        """Of a target that has been sampled, with the usual weights."""
+        """The loss for a sampled target, with the default weights."""
         loss = cls.__new__(cls)
         loss._take(patches, samples, level, 1e-3, 1e-3)
         return loss
@@ -78,14 +78,14 @@ class PatchLoss:
         self.length = float(mean_edges(exact).mean())
         like = patches.vertices
         points = samples.points + samples.heights[:, None] * samples.directors
-        for name, array in (("targets", points), ("wanted", samples.normals), ("areas", samples.areas)):
+        for name, array in (("targets", points), ("target_normals", samples.normals), ("areas", samples.areas)):
             setattr(self, name, torch.tensor(array).to(like))
         patch, coordinates = edge_pairs(patches.triangles.cpu().numpy().astype(np.int64), level)
         self.places = _moved(patches, samples.places.patch, samples.places.barycentrics)
         self.sides = _moved(patches, torch.tensor(patch.reshape(-1)), torch.tensor(coordinates.reshape(-1, 3)))
 
     def terms(self, patches: PatchSurface) -> tuple[Tensor, Tensor, Tensor]:
-        """The means of the three terms: of distance over L, normal and crease, each squared."""
+        """The means of the three squared terms: distance over L, normal and crease."""
         _check_patches(patches)
         mine, theirs = self._triangles, patches.triangles
         if patches.vertices.dtype != self.targets.dtype or theirs.device != mine.device:
@@ -98,15 +98,15 @@ class PatchLoss:
                 f"PatchLoss: patches must have the {len(mine)} triangles that the loss was made for, got {patches!r}"
             )
         surface = patches.surface(self.places)
-        distance = ((surface.points - self.targets) * self.wanted).sum(-1) / self.length
-        turned = (surface.normals - self.wanted).square().sum(-1)
+        distance = ((surface.points - self.targets) * self.target_normals).sum(-1) / self.length
+        turned = (surface.normals - self.target_normals).square().sum(-1)
         left, right = patches.surface(self.sides).normals.chunk(2)
         creases = (left - right).square().sum(-1)
         crease = creases.mean() if len(creases) else creases.sum()
         return (self.areas * distance.square()).sum(), (self.areas * turned).sum(), crease
 
     def __call__(self, patches: PatchSurface) -> Tensor:
-        """The loss of patches over the same triangles: other quadrics, or another shape (`with_shape`)."""
+        """The loss of patches over the same triangles, with other quadrics or another shape (`with_shape`)."""
         distance, normal, crease = self.terms(patches)
         return distance + self.normal_weight * normal + self.edge_weight * crease
 
@@ -129,10 +129,10 @@ def descend(
     least: float,
     progress: bool = False,
 ) -> QuadricNumbers:
-    """Adam with a rate that falls to nothing, each radius kept between `least` and its cap [m]."""
+    """Adam with a learning rate that decays to zero; each radius stays between `least` and its cap [m]."""
     parts = [torch.tensor(part, requires_grad=True) for part in np.split(numbers.rows, [1, 4], axis=1)]
     rates = (0.02 * loss.length * 0.1, 0.02 * loss.length, 0.02)
-    # factors below the diagonal are in 1/m
+    # factors off the diagonal are in 1/m
     slanted = torch.tensor([1.0] * 3 + [1.0 / loss.length] * 3, dtype=torch.float64)
     parts[2] = (parts[2].detach() / slanted).requires_grad_()
     optimizer = torch.optim.Adam([{"params": [p], "lr": r} for p, r in zip(parts, rates, strict=True)])
@@ -151,7 +151,7 @@ def descend(
 
 
 def _within(parts: list[Tensor], slanted: Tensor, numbers: QuadricNumbers, least: float) -> QuadricNumbers:
-    """The parameters with their radii between the bounds, written back into them."""
+    """Clamp the radii of the parameters to their bounds, in place."""
     with torch.no_grad():
         rows = torch.cat([parts[0], parts[1], parts[2] * slanted], dim=1).numpy()
         kept = within_radii(QuadricNumbers(rows, numbers.cap), least)

@@ -1,6 +1,6 @@
-"""Python side of the ops of free-form patches: fake kernels, derivatives, rules for vmap.
+"""Python side of the ops of free-form patches: fake kernels, derivatives, vmap rules.
 
-The maths is in csrc/freeform. Each op has an adjoint that is an op too, `<name>_vjp`, without a derivative of its own.
+The kernels are in csrc/freeform. The adjoint of each op is an op too, `<name>_vjp`, without a derivative.
 """
 
 from __future__ import annotations
@@ -164,7 +164,7 @@ def _no_second_derivative(ctx: Any, *_: Any) -> None:
 
 
 def _no_derivative(ctx: Any, *_: Any) -> None:
-    raise RuntimeError("torchpd: the search along rays has no derivative; PatchRays.cast gives that of its result")
+    raise RuntimeError("torchpd: the ray search has no derivative; PatchRays.cast differentiates its result")
 
 
 def _save_nothing(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:

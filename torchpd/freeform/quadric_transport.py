@@ -1,4 +1,4 @@
-"""How a pose carries the quadrics of the published field along: a frame for every quadric, the same all over space."""
+"""Transport of the published field's quadrics by a pose: one affine frame per quadric."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from .transport import PatchTransport
 __all__ = ["QuadricTransport"]
 
 _ops = torch.ops.torchpd
-_STEPS = 9  # midpoints along an edge, at which the weights are measured
+_STEPS = 9  # midpoints along an edge, for the integration of the weights
 
 
 class QuadricTransport:
     """Carries the quadrics of `FreeFormPatches.field` along, as splats are carried.
 
-    Every patch moves by an affine map, x -> v + G (x - V). A quadric goes by T, the mean of the maps of the patches
-    that it touches, weighted by the integral of [Q]_+^3 over each: its matrix becomes W' = T^-T W T^-1. So a quadric
-    stays one quadric, its field is as smooth in a pose as at rest, and an affine motion of vertices and apexes carries
-    it along exactly while no singular value is clamped. (In `FreeFormPatches.surface` quadrics never move.)
+    Every patch moves by an affine map, x -> v + G (x - V). A quadric moves by T, the mean of the maps of the patches
+    that it touches, weighted by the integral of [Q]_+^3 over each. Its matrix becomes W' = T^-T W T^-1. So a quadric
+    stays one quadric, and its field is as smooth in a pose as at rest. An affine motion of vertices and apexes carries
+    it exactly while no singular value is clamped. (In `FreeFormPatches.surface` quadrics never move.)
 
-    The weights are found once, from `patches` as they are, and are constants; centres and factors have gradients.
+    The weights are computed once from `patches` and stay constant; centres and factors have gradients.
 
     Args:
         transport: of the same patches: their gradients, clamps and mode.
@@ -56,14 +56,14 @@ class QuadricTransport:
         count = len(patches.quadrics)
         own = np.arange(4 * count, dtype=np.int64).reshape(count, 4)
         arrays = (own, *corner_lists(own, 4 * count))
-        # constraints of the op that clamps, one for each quadric
+        # inputs of the op that clamps, one per quadric
         self._own = [torch.as_tensor(a, dtype=torch.int32, device=tets.device).contiguous() for a in arrays]
 
     def __call__(self, positions: Tensor, fallback: Tensor | None = None) -> Tensor:
         """Matrices W' [B, Q, 4, 4], for `matrices` of `FreeFormPatches.field` and `PatchRays.cast_field`.
 
         Args:
-            positions: of vertices and apexes, in this order, [B, V + K, 3] [m].
+            positions: vertices, then apexes, [B, V + K, 3] [m].
             fallback: see `PatchTransport.gradients`.
         """
         self._check_kind()
@@ -75,7 +75,7 @@ class QuadricTransport:
         mean = self._mean(torch.cat([G.flatten(2), moved], dim=2))
         centres = mean[..., 9:]
         back = inverse(self._clamped(mean[..., :9].unflatten(2, (3, 3))))
-        # T^-1, which takes a point of the pose back: x -> A^-1 (x - c') + c
+        # T^-1 maps a point of the pose back to rest: x -> A^-1 (x - c') + c
         back = torch.cat([back, (q.centres - product(back, centres[..., None])[..., 0])[..., None]], dim=3)
         last = back.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*back.shape[:2], 1, 4)
         back = torch.cat([back, last], dim=2)
@@ -100,7 +100,7 @@ class QuadricTransport:
             )
 
     def _clamped(self, mean: Tensor) -> Tensor:
-        """The mean of clamped gradients can still be flat: where patches turn to different sides."""
+        """Clamp the mean of clamped gradients, which can still be flat where patches rotate apart."""
         if self.transport.mode == "rotation":
             return nearest_rotation(mean)
         corners = torch.cat([torch.zeros_like(mean[..., :1]), mean], dim=3).mT.flatten(1, 2)
@@ -112,19 +112,19 @@ class QuadricTransport:
 
 @torch.no_grad()
 def _shares(patches: PatchSurface) -> tuple[Tensor, Tensor, Tensor]:
-    """Patch, quadric and weight of every pair [N], quadric by quadric; the weights of each sum to 1."""
+    """Patch, quadric and weight of every pair [N], ordered by quadric; the weights of each sum to 1."""
     q = patches.quadrics
     corners = patches.vertices[patches.triangles.long()]
     edges = corners[:, 1:] - corners[:, :1]
     areas = 0.5 * torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=1)
     patch, number = patches.lists[3].long(), patches.lists[2].long()  # of every pair that touches
-    # middles of the cells of a triangle that is cut into _STEPS x _STEPS of them
+    # centroids of the cells of a triangle cut into _STEPS x _STEPS
     rows = [((3 * i + 1, 3 * j + 1), (3 * i + 2, 3 * j + 2)) for i in range(_STEPS) for j in range(_STEPS)]
     b = np.array([p for cell in rows for p in cell if sum(p) < 3 * _STEPS]) / (3 * _STEPS)
     places = product(torch.as_tensor(np.column_stack([1.0 - b.sum(1), b])).to(corners), corners[patch])
     y = product(places - q.centres[number][:, None], q.triangular()[number].mT)
     bump = (1.0 - y.square().sum(2)).clamp_min(0.0).pow(3).mean(1) * areas[patch]
-    # one that no triangle reaches goes by those that it touches, else by the nearest
+    # a quadric that no triangle reaches takes the patches that it touches, else the nearest
     total = torch.zeros_like(q.amplitudes).index_add_(0, number, bump)
     bump = torch.where(total[number] > 0.0, bump, areas[patch])
     lonely = torch.ones_like(q.amplitudes, dtype=torch.bool).index_fill_(0, number, False).nonzero()[:, 0]

@@ -1,4 +1,4 @@
-"""Quadrics: the perturbations that free-form patches add to their base, each an ellipsoid with a height."""
+"""Quadrics: ellipsoidal perturbations, each with a height, that free-form patches add to their base."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LOWER = ((0, 0), (1, 1), (2, 2), (1, 0), (2, 0), (2, 1))  # entries of M in the
 
 
 def check_real_tensor(name: str, value: Any, shape: tuple[int | None, ...], meaning: str) -> None:
-    """A float32 or float64 tensor of this shape, None standing for any length."""
+    """Check for a float32 or float64 tensor of this shape; None stands for any length."""
     if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
         came = str(value.dtype) if isinstance(value, Tensor) else type(value).__name__
         raise TypeError(f"{name} must be a float32 or float64 tensor ({meaning}), got {came}")
@@ -29,12 +29,12 @@ def check_real_tensor(name: str, value: Any, shape: tuple[int | None, ...], mean
 
 
 def dimensions(value: Any) -> int:
-    """Of a tensor; -1 of anything else, for a check that follows."""
+    """Number of dimensions of a tensor; -1 for anything else, for a later check."""
     return value.dim() if isinstance(value, Tensor) else -1
 
 
 def matrix_sets(matrices: Tensor) -> Tensor:
-    """W [B or 1, Q, 4, 4] of what may be [Q, 4, 4]."""
+    """W [B or 1, Q, 4, 4] from matrices with or without a batch."""
     if dimensions(matrices) not in (3, 4):
         came = list(matrices.shape) if dimensions(matrices) >= 0 else type(matrices).__name__
         raise TypeError(f"matrices must be a tensor W [Q, 4, 4], or [B, Q, 4, 4] in B poses, got {came}")
@@ -45,11 +45,11 @@ def matrix_sets(matrices: Tensor) -> Tensor:
 class Quadrics:
     """Perturbations R_i(x) = a_i [1 - |M_i (x - c_i)|^2]_+^3: a_i at the centre, 0 outside of an ellipsoid, C2.
 
-    M is lower triangular with a positive diagonal, so that any values of these ten numbers are an ellipsoid, and all
-    ten can be optimised. A negative amplitude makes a dent.
+    M is lower triangular with a positive diagonal. Any values of these ten numbers give an ellipsoid, so all ten can be
+    optimised. A negative amplitude makes a dent.
 
     Args:
-        amplitudes: a [Q], the height that a quadric raises the surface by at its centre [m].
+        amplitudes: a [Q], height of the surface at the centre of a quadric [m].
         centres: c [Q, 3] at rest [m].
         factors: ln M00, ln M11, ln M22, M10, M20, M21 [Q, 6], M in 1/m.
     """
@@ -73,13 +73,13 @@ class Quadrics:
 
     @classmethod
     def none(cls, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Quadrics:
-        """No quadrics at all: the surface is its base."""
+        """No quadrics: the surface is its base."""
         empty = torch.empty(0, 6, dtype=dtype, device=device)
         return cls(empty[:, 0].clone(), empty[:, :3].clone(), empty)
 
     @classmethod
     def from_radii(cls, amplitudes: Tensor, centres: Tensor, radii: Tensor) -> Quadrics:
-        """Balls of radii [Q], or ellipsoids along the axes with radii [Q, 3] [m]."""
+        """Spheres of radii [Q], or axis-aligned ellipsoids with radii [Q, 3] [m]."""
         check_real_tensor("Quadrics.from_radii: centres", centres, (None, 3), "centres [m]")
         shape = (len(centres), 3) if dimensions(radii) == 2 else (len(centres),)
         check_real_tensor("Quadrics.from_radii: radii", radii, shape, "radii [m]")
@@ -90,17 +90,17 @@ class Quadrics:
 
     @classmethod
     def from_matrices(cls, matrices: Tensor, signs: Tensor | None = None) -> Quadrics:
-        """From general quadrics Q(x) = (x, 1)^T W (x, 1), each perturbing by sign [Q]_+^3.
+        """Convert general quadrics Q(x) = (x, 1)^T W (x, 1), each perturbing by sign [Q]_+^3.
 
         Ellipsoids only: W = s [[-A, A c], [c^T A, 1 - c^T A c]] with A positive definite and s = |a|^(1/3) > 0.
 
         Args:
             matrices: W [Q, 4, 4], symmetric.
-            signs: +1 or -1 of each [Q]; all +1 when left out.
+            signs: +1 or -1 of each [Q]; default +1.
 
         Raises:
-            ValueError: a matrix is not finite, not symmetric, or {Q > 0} is not an ellipsoid (a cone, a cylinder, a
-                hyperboloid or empty); the literal field of `FreeFormPatches.field` takes those.
+            ValueError: a matrix is not finite or not symmetric, or {Q > 0} is a cone, a cylinder, a hyperboloid or
+                empty. `FreeFormPatches.field` takes those.
         """
         check_real_tensor("Quadrics.from_matrices: matrices", matrices, (None, 4, 4), "symmetric W")
         count = len(matrices)
@@ -112,7 +112,7 @@ class Quadrics:
         _refuse_rows("matrices must be symmetric", skew)
         _refuse_rows("signs must be +1 or -1", signs.abs() != 1)
         scaled = -matrices[:, :3, :3]
-        # M^T M = A with M lower triangular is Cholesky's factor of A with its rows and columns reversed, reversed
+        # M^T M = A with M lower triangular: reverse rows and columns of A, factor by Cholesky, and reverse again
         reverse, failed = torch.linalg.cholesky_ex(scaled.flip(-1, -2))
         lower = reverse.flip(-1, -2).mT
         half = torch.linalg.solve_triangular(lower.mT, matrices[:, :3, 3:], upper=True)
@@ -130,15 +130,15 @@ class Quadrics:
     def matrices(self) -> tuple[Tensor, Tensor]:
         """General form: symmetric W [Q, 4, 4] and signs [Q], with R(x) = sign [(x, 1)^T W (x, 1)]_+^3.
 
-        The inverse of `from_matrices`, but for quadrics of amplitude 0, whose W is 0, without a gradient to it.
+        The inverse of `from_matrices`, except for quadrics of amplitude 0, whose W is 0 without a gradient.
         """
-        # the cube root of 0 has an infinite slope
+        # the cube root has an infinite slope at 0
         there = self.amplitudes != 0
         scale = torch.where(there, torch.where(there, self.amplitudes, 1.0).abs().pow(1.0 / 3.0), 0.0)
         return scale[:, None, None] * self.normalized_matrices(), torch.where(self.amplitudes < 0, -1.0, 1.0).to(scale)
 
     def normalized_matrices(self) -> Tensor:
-        """W [Q, 4, 4] with the value 1 at the centre: R(x) = a [(x, 1)^T W (x, 1)]_+^3."""
+        """W [Q, 4, 4], scaled to the value 1 at the centre: R(x) = a [(x, 1)^T W (x, 1)]_+^3."""
         m = self.triangular()
         A = product(m.mT, m)
         Ac = product(A, self.centres[:, :, None])
@@ -146,7 +146,7 @@ class Quadrics:
         return torch.cat([torch.cat([-A, Ac], dim=2), torch.cat([Ac.mT, corner], dim=2)], dim=1)
 
     def entries(self) -> Tensor:
-        """M00, M11, M22, M10, M20, M21 [Q, 6] in 1/m, as the ops take them."""
+        """M00, M11, M22, M10, M20, M21 [Q, 6] in 1/m, the input of the ops."""
         return torch.cat([self.factors[:, :3].exp(), self.factors[:, 3:]], dim=1)
 
     def triangular(self) -> Tensor:
@@ -157,7 +157,7 @@ class Quadrics:
         return torch.stack(rows, dim=1)
 
     def values(self, points: Tensor) -> Tensor:
-        """R_i [..., Q] of each quadric at points [..., 3], in plain torch."""
+        """R_i [..., Q] of each quadric at points [..., 3] m, in plain torch."""
         _check_points(points, self.centres.dtype)
         y = product(self.triangular(), (points[..., None, :] - self.centres)[..., None])
         return self.amplitudes * (1.0 - y[..., 0].square().sum(-1)).clamp_min(0.0) ** 3

@@ -1,7 +1,7 @@
-"""Rays that meet free-form patches: where they first hit the surface in any pose, or the published field.
+"""Ray casting against free-form patches: first hits of the surface in any pose, or of the published field.
 
-Hits on the surface are differentiable by the implicit function theorem: the search is not, but one step of Newton's
-method from its result is, and its value does not move.
+Hits on the surface are differentiable by the implicit function theorem. The search itself is not: one Newton step from
+its result carries the derivative and leaves the value unchanged.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _FINEST = 32
 
 @dataclass(frozen=True, eq=False)
 class PatchHits:
-    """What B x R rays hit, missing: infinite depth, patch -1, zeros. All but `hit` and `patch` have gradients."""
+    """Hits of B x R rays. Misses have infinite depth, patch -1, zeros. All but `hit` and `patch` have gradients."""
 
     hit: Tensor  # bool [B, R]
     depth: Tensor  # [B, R] m along the ray
@@ -44,7 +44,7 @@ class PatchHits:
 
 
 class SurfaceRays:
-    """The search of `PatchRays`, which documents it."""
+    """The search of `PatchRays`, documented there."""
 
     def __init__(self, patches: PatchSurface, level: int | None = None) -> None:
         if not isinstance(patches, PatchSurface):
@@ -73,14 +73,14 @@ class SurfaceRays:
     ) -> PatchHits:
         """The first hit of every ray.
 
-        Gradients go to quadrics, pose, base, origins and directions; that a ray hits or misses has none, nor does the
-        outline of the surface. Where they are wanted hits are gathered, and this waits for the device.
+        Gradients flow to quadrics, pose, base, origins and directions. The switch between hit and miss has none, nor
+        has the outline of the surface. With gradients, hits are gathered, which waits for the device.
 
         Args:
             origins: [R, 3], or [B, R, 3] in B poses [m].
-            directions: like origins, of any length but zero.
-            pose: of B environments; at rest, B = 1, when left out.
-            patches: in place of those given at the start, with the same triangles.
+            directions: like origins, of any nonzero length.
+            pose: of B environments; default at rest, B = 1.
+            patches: replace those of the constructor; they must have the same triangles.
             near, far: hits count between these distances along the ray [m].
         """
         surface = self._surface(patches)
@@ -105,8 +105,9 @@ class SurfaceRays:
         near: float = 0.0,
         far: float = math.inf,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """What `cast` finds before it looks at the hits: nothing has a gradient, and nothing waits for the device
-        unless `patches` have triangles of their own, which are compared.
+        """Search for hits without gradients and without waiting for the device.
+
+        The only wait is the comparison of triangles, if `patches` have their own.
 
         Returns:
             Depth [B, R] in m, infinite for a miss; patch int32 [B, R], -1 for a miss; barycentrics [B, R, 3].
@@ -128,7 +129,7 @@ class SurfaceRays:
         *,
         shape: bool,
     ) -> tuple[Tensor, ...]:
-        """What `search` returns, and with `shape` the points and normals of the hits."""
+        """The result of `search`; with `shape` also the points and normals of the hits."""
         o, d = _batched("origins", origins, surface), _batched("directions", directions, surface)
         q = surface.quadrics
         found: tuple[Tensor, ...] = _ops.patch_surface_rays(
@@ -153,18 +154,18 @@ class SurfaceRays:
     ) -> tuple[Tensor, Tensor]:
         """The first point on every ray where `FreeFormPatches.field` is not negative on any patch.
 
-        A ray that starts inside is there at once. Exact but for rounding, whatever the quadrics: along a ray the field
-        is piecewise a polynomial. A tree of boxes finds the patches that a ray may enter; one with a quadric that is no
-        ellipsoid and has positive amplitude is tried for every ray. Where thickness and quadrics are zero the solid has
+        A ray that starts inside ends at once. The result is exact up to rounding for any quadrics: along a ray the
+        field is piecewise polynomial. A tree of boxes finds the patches that a ray may enter. Every ray tries a patch
+        with a quadric of positive amplitude that is not an ellipsoid. With zero thickness and no quadrics the solid has
         no inside, and rays pass. No gradients.
 
         Args:
             origins, directions: as for `cast`.
-            far: where to stop [m], finite.
-            near: where to begin [m].
-            positions: vertices [B, V, 3] [m]; at rest when left out.
+            far: end of the ray [m], finite.
+            near: start of the ray [m].
+            positions: vertices [B, V, 3] [m]; default at rest.
             reading, matrices: as for `FreeFormPatches.field`.
-            exhaustive: try every patch for every ray. The result is the same, later.
+            exhaustive: try every patch for every ray; slower, with the same result.
 
         Returns:
             Depth [B, R] in m, infinite for a miss, and patch int32 [B, R], -1 for a miss.
@@ -220,9 +221,9 @@ def _batched(name: str, rays: Tensor, surface: PatchSurface) -> Tensor:
 
 
 def _rays(origins: Tensor, directions: Tensor, surface: PatchSurface) -> tuple[Tensor, Tensor]:
-    """With a batch, and of unit length."""
+    """Add a batch and normalise the directions."""
     o, d = _batched("origins", origins, surface), _batched("directions", directions, surface)
-    # first by the largest component, whose square alone might be beyond all numbers
+    # first divide by the largest component, whose square alone might overflow
     d = d / d.detach().abs().amax(-1, keepdim=True)
     return o, torch.nn.functional.normalize(d, dim=-1, eps=0.0)
 
@@ -236,7 +237,7 @@ def _posed(surface: PatchSurface, pose: PatchPose | None) -> PatchPose:
 
 
 def _fine_enough(patches: PatchSurface) -> int:
-    """Cells no longer than half the radii of quadrics: twice the greatest |M_i e|, e the edges of its patches."""
+    """Cells no longer than half the radii of quadrics: twice the largest |M_i e| over the edges e of its patches."""
     quadric, patch = patches.lists[2].long(), patches.lists[3].long()
     if len(quadric) == 0:
         return 4
@@ -247,7 +248,7 @@ def _fine_enough(patches: PatchSurface) -> int:
 
 
 def _cells(patches: PatchSurface, level: int) -> tuple[Any, Any, Any]:
-    """Cells [C, 17], weights [12, 3] and places [m^2, 9] as csrc/freeform/rays.h has them."""
+    """Cells [C, 17], weights [12, 3] and barycentrics [m^2, 9] in the layout of csrc/freeform/rays.h."""
     elements = patches.triangles.cpu().numpy().astype(np.int64)
     steps, triangles = grid(level)
     fine = _CHECKS * level
@@ -255,7 +256,7 @@ def _cells(patches: PatchSurface, level: int) -> tuple[Any, Any, Any]:
     inner = grid(_CHECKS)[0]
     corners = np.eye(3, dtype=np.int64) * _CHECKS
     inner = np.concatenate([corners, inner[inner.max(axis=1) < _CHECKS]])
-    # of every corner and check of a cell, its place in the fine grid
+    # position in the fine grid of every corner and check point of a cell
     place = np.einsum("kc,tcs->tks", inner, steps[triangles])
     row = fine - place[..., 0]
     points = number[:, row * (row + 1) // 2 + place[..., 2]]  # [P, m^2, 15]
@@ -271,10 +272,10 @@ def _cells(patches: PatchSurface, level: int) -> tuple[Any, Any, Any]:
 
 
 def _tree_order(middles: Any, per_leaf: int) -> Any:
-    """Things in the order of the leaves: halved at the median of their longest extent, again and again.
+    """The order of the leaves: halved at the median of the longest extent, recursively.
 
-    The halves are those of the complete tree in csrc/freeform/box_tree.h, leaf l of 2^L from l C / 2^L on, so many or
-    more in each.
+    The halves are those of the complete tree in csrc/freeform/box_tree.h: leaf l of 2^L starts at l C / 2^L, and each
+    has at least `per_leaf` items.
     """
     count = len(middles)
     order = np.arange(count)
@@ -290,7 +291,7 @@ def _tree_order(middles: Any, per_leaf: int) -> Any:
 
 
 def _in_poses(surface: PatchSurface, pose: PatchPose, number: Tensor, where: PatchSamples) -> SurfacePoints:
-    """The surface at samples of which each has its own pose, without a batch: all poses side by side as one surface."""
+    """The surface at samples that each have their own pose: all poses side by side as one surface, without a batch."""
     batch, V, P = len(pose.positions), len(surface.vertices), len(surface.triangles)
     if batch * 3 * P >= 2**31:
         raise ValueError(f"cast: poses x patches must stay below 2^31 / 3, got {batch} x {P}")
@@ -316,16 +317,16 @@ def _in_poses(surface: PatchSurface, pose: PatchPose, number: Tensor, where: Pat
 
 
 def _with_gradients(surface: PatchSurface, pose: PatchPose, hits: PatchHits, o: Tensor, d: Tensor) -> PatchHits:
-    """The same numbers, with gradients by the implicit function theorem."""
+    """The same hits, with gradients by the implicit function theorem."""
     number, ray = hits.hit.nonzero(as_tuple=True)
     where = surface.samples(hits.patch[hits.hit], hits.barycentrics[hits.hit])
     at = _in_poses(surface, pose, number, where)
-    # S(b) = o + t d: b and t move by the solution of a linear system whose matrix may be taken as constant
+    # S(b) = o + t d: b and t change by the solution of a linear system whose matrix may be treated as constant
     o, d = o[number, ray], d[number, ray]
     left = at.points - (o + hits.depth[hits.hit][:, None] * d)
     matrix = torch.cat([at.tangents.detach(), -d.detach()[:, None]], dim=1).mT
     moved = -torch.linalg.solve_ex(matrix, left[..., None])[0][..., 0]
-    moved = moved - moved.detach()  # of value zero
+    moved = moved - moved.detach()  # zero in value, but with a gradient
     changed = torch.cat([moved[:, :2], -moved[:, :1] - moved[:, 1:2]], dim=1)
     at = _in_poses(surface, pose, number, where.at(where.barycentrics + changed))
 

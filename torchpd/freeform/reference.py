@@ -1,4 +1,4 @@
-"""Free-form patches in float64 with plain NumPy, from the formulas alone: slow, and what the ops are compared with."""
+"""Free-form patches in float64 with plain NumPy, directly from the formulas: the slow reference of the ops."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _numbers(tensor: Any) -> Array:
 
 
 class PatchReference:
-    """The surface of some patches; every quadric counts, touching or not.
+    """The surface of some patches; every quadric counts, whether it touches a patch or not.
 
     S = sum_k b_k (v_k + A_k ((X - V_k) / 2 + H_k N_k)), H_k = h + 3/4 w_k for a base of Phong tessellation, else h,
     with X = sum_k b_k V_k and w_k = sum_j b_j (V_k - V_j) . N_k.
@@ -37,7 +37,7 @@ class PatchReference:
         self.matrices = _numbers(patches.quadrics.triangular())
         self.on_surface = patches.measured_at == "surface"
         self.weight = 0.75 if patches.base == "phong" else 0.0
-        self._heights: dict[tuple[int, bytes], float] = {}  # they are the same in every pose
+        self._heights: dict[tuple[int, bytes], float] = {}  # equal in every pose
 
     def bumps(self, x: Array) -> Array:
         """sum_i R_i at x [..., 3]."""
@@ -50,7 +50,7 @@ class PatchReference:
         return self.weight * np.array([sum(b[j] * (v[k] - v[j]) @ n[k] for j in range(3)) for k in range(3)])
 
     def height(self, patch: int, b: Array) -> float:
-        """h, the root nearest to the outside where it is measured on the surface."""
+        """h [m], the outermost root if it is measured on the surface."""
         place = patch, b.tobytes()
         if place not in self._heights:
             self._heights[place] = self._height(patch, b)
@@ -109,13 +109,13 @@ def literal_field(
 
 
 def clamped_gradient(G: Array, lower: float, upper: float) -> Array:
-    """G [3, 3] with singular values between two bounds and a positive determinant."""
+    """G [3, 3] with singular values clamped between two bounds and a positive determinant."""
     U, s, Vt = np.linalg.svd(G)
     return np.asarray(U * np.clip(s, lower, upper) * [1.0, 1.0, np.sign(np.linalg.det(U @ Vt))] @ Vt)
 
 
 def vertex_frames(gradients: Array, triangles: Index, vertices: Array) -> Array:
-    """The mean of gradients [P, 3, 3] around each vertex, weighted by the areas of the triangles at rest."""
+    """The mean of gradients [P, 3, 3] around each vertex, weighted by the triangle areas at rest."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     total, weight = np.zeros((len(vertices), 3, 3)), np.zeros(len(vertices))

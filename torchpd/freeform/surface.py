@@ -1,7 +1,7 @@
-"""Free-form patches: triangles that quadrics raise to a curved surface, watertight in every pose, in few numbers.
+"""Free-form patches: triangles that quadrics raise to a curved surface, watertight in every pose.
 
-Vyatkin and Dolgovesov (2023), joined by shell coordinates: neighbours share vertices, directors and quadrics, hence the
-same sheet over their edge. The surface is continuous everywhere and C2 inside each patch; across edges it may crease.
+Vyatkin and Dolgovesov (2023), joined by shell coordinates. Neighbours share vertices, directors and quadrics, hence
+the same surface at their edge. It is continuous everywhere and C2 inside each patch; across edges it may crease.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..common.reprs import by_sizes
 from ..geometry.mesh_checks import set_frozen
 from ..geometry.tri_mesh import TriMesh
 from . import ops as patch_ops  # noqa: F401  (registers the ops)
-from .adjacency import Touching, gather_lists, touching
+from .adjacency import TouchingPairs, find_touching_pairs, gather_lists
 from .checks import angle_weighted_normals, check_surface
 from .quadrics import Quadrics, check_real_tensor, dimensions, matrix_sets
 
@@ -35,7 +35,7 @@ Reading: TypeAlias = Literal["clip", "literal"]
 
 
 class PatchPose(NamedTuple):
-    """Where vertices are and how their surroundings are turned and stretched; `PatchTransport.pose` makes it."""
+    """Positions of the vertices, and frames that rotate and stretch their surroundings; see `PatchTransport.pose`."""
 
     positions: Tensor  # [B, V, 3] m
     frames: Tensor  # [B, V, 3, 3]
@@ -49,7 +49,7 @@ class SurfacePoints(NamedTuple):
 
     points: Tensor  # [B, S, 3] m
     normals: Tensor  # [B, S, 3] unit, outwards
-    tangents: Tensor  # [B, S, 2, 3] m, derivatives along the first two barycentric coordinates (the third gives way)
+    tangents: Tensor  # [B, S, 2, 3] m, derivatives by the first two barycentric coordinates (the third compensates)
 
     def __repr__(self) -> str:
         return by_sizes(self, self.points, "batch", "samples")
@@ -57,7 +57,7 @@ class SurfacePoints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PatchSamples:
-    """Places on patches, in any order; `FreeFormPatches.samples` makes them."""
+    """Points on patches, in any order; made by `FreeFormPatches.samples`."""
 
     patch: Tensor  # int32 [S]
     barycentrics: Tensor  # [S, 3]
@@ -76,7 +76,7 @@ class PatchSamples:
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
 class PatchSurface:
-    """Points, normals, heights and field of a surface of free-form patches, which `FreeFormPatches` documents."""
+    """Points, normals, heights and field of a surface of free-form patches; `FreeFormPatches` documents it."""
 
     vertices: Tensor
     triangles: Tensor  # int32 [P, 3]
@@ -86,7 +86,7 @@ class PatchSurface:
     measured_at: MeasuredAt
     thickness: float
     lists: tuple[Tensor, ...]  # the first eight arrays of csrc/freeform/lists.def
-    reach: Tensor  # [P] bound of |h| where it is measured on the surface, else 0 [m]
+    reach: Tensor  # [P] bound of |h| if measured on the surface, else 0 [m]
     steepness: Tensor  # [P] bound of d/dh sum_i R_i(P + h D) there, else 0
 
     def __init__(
@@ -121,9 +121,9 @@ class PatchSurface:
         self._own(quadrics)
 
     def _own(self, quadrics: Quadrics) -> None:
-        """Take these quadrics and find which patches they touch."""
+        """Store the quadrics and find the patches that they touch."""
         _check_quadrics(quadrics, self.vertices)
-        pairs = self._touching(quadrics)
+        pairs = self._touching_pairs(quadrics)
         if self.measured_at == "surface":
             _check_unique(pairs)
         elements = self.triangles.cpu().numpy().astype(np.int64)
@@ -137,14 +137,14 @@ class PatchSurface:
             steepness=torch.as_tensor(pairs.steepness, dtype=dtype, device=device),
         )
 
-    def _touching(self, quadrics: Quadrics) -> Touching:
+    def _touching_pairs(self, quadrics: Quadrics) -> TouchingPairs:
         arrays = [
             t.detach().cpu().double().numpy()
             for t in (self.vertices, self.directors, quadrics.amplitudes, quadrics.centres, quadrics.triangular())
         ]
         vertices, directors, amplitudes, centres, m = arrays
         elements = self.triangles.cpu().numpy().astype(np.int64)
-        return touching(
+        return find_touching_pairs(
             vertices, elements, directors, amplitudes, centres, m,
             curved=self.base == "phong", on_surface=self.measured_at == "surface",
         )  # fmt: skip
@@ -163,9 +163,9 @@ class PatchSurface:
 
         Args:
             quadrics: of the same precision and device.
-            keep_lists: trust that they touch the patches that the present ones touch, as many as these in the same
-                order. Nothing is checked and nothing waits for the device: for the inner loop of an optimisation,
-                between calls without it.
+            keep_lists: reuse the lists of touched patches. The quadrics must be as many and in the same order. Nothing
+                is checked and nothing waits for the device: use it in the inner loop of an optimisation, between calls
+                without it.
         """
         other = self._copy()
         if not keep_lists:
@@ -181,7 +181,7 @@ class PatchSurface:
     def with_shape(self, vertices: Tensor, directors: Tensor) -> Self:
         """The same triangles, quadrics and lists over other rest vertices and directors, which are not checked.
 
-        For gradients with respect to the base; make new patches when the shape has moved.
+        Use it for gradients by the base; make new patches once the shape has moved.
         """
         check_real_tensor("with_shape: vertices", vertices, tuple(self.vertices.shape), "positions at rest [m]")
         check_real_tensor("with_shape: directors", directors, tuple(self.directors.shape), "unit vectors")
@@ -207,7 +207,7 @@ class PatchSurface:
 
     def _copy(self) -> Self:
         other = object.__new__(type(self))
-        # by name: torch.compile cannot see through the object's dictionary in every version of torch
+        # by name: some versions of torch.compile cannot trace the object's dictionary
         for name in _FIELDS:
             object.__setattr__(other, name, getattr(self, name))
         return other
@@ -215,11 +215,11 @@ class PatchSurface:
     # ---- evaluation
 
     def samples(self, patch: Tensor, barycentrics: Tensor) -> PatchSamples:
-        """Places to evaluate at.
+        """Sample points for evaluation.
 
         Args:
             patch: of each sample, integers [S].
-            barycentrics: coordinates of each sample [S, 3], which add up to one.
+            barycentrics: coordinates of each sample [S, 3], with sum 1.
         """
         check_real_tensor("samples: barycentrics", barycentrics, (None, 3), "barycentric coordinates")
         if not isinstance(patch, Tensor):
@@ -231,7 +231,7 @@ class PatchSurface:
                 f"got {patch.dtype} {list(patch.shape)}"
             )
         count = len(self.triangles)
-        # before they are narrowed to 32 bits
+        # checked before the conversion to 32 bits
         if len(patch) and not (int(patch.min()) >= 0 and int(patch.max()) < count):
             raise IndexError(f"samples: patch must lie in 0..{count - 1}, got {int(patch.min())} to {int(patch.max())}")
         number = patch.detach().to(device=self.vertices.device, dtype=torch.int32)
@@ -240,7 +240,7 @@ class PatchSurface:
         return PatchSamples(number, barycentrics, (number, starts.to(torch.int32), order.to(torch.int32)))
 
     def heights(self, samples: PatchSamples) -> tuple[Tensor, Tensor]:
-        """Heights h [S] over the base [m], and their derivatives [S, 2] along b_1 and b_2 (b_3 gives way)."""
+        """Heights h [S] over the base [m], and their derivatives [S, 2] by b_1 and b_2 (b_3 compensates)."""
         _check_kind("samples", samples, PatchSamples, "FreeFormPatches.samples makes them")
         q = self.quadrics
         h, slopes = _ops.patch_height(
@@ -254,12 +254,12 @@ class PatchSurface:
     ) -> SurfacePoints:
         """Points, normals and tangents, at rest or in poses.
 
-        Heights belong to the material: they are the same in every pose.
+        Heights are fixed in the material: they are equal in every pose.
 
         Args:
-            samples: where.
-            pose: of B environments; at rest when left out.
-            heights: what `heights(samples)` gave, if it is known.
+            samples: points to evaluate.
+            pose: of B environments; default at rest.
+            heights: the result of `heights(samples)`, if known.
         """
         _check_kind("samples", samples, PatchSamples, "FreeFormPatches.samples makes them")
         h, slopes = self.heights(samples) if heights is None else heights
@@ -287,17 +287,17 @@ class PatchSurface:
     ) -> Tensor:
         """The published field F' of single patches: positive inside, 0 on the boundary.
 
-        F is the least of five planes, three through the edges perpendicular to the triangle and two at `thickness` on
-        either side of it. "literal" adds the quadrics to F, "clip" to the outer base plane alone. Patches of this field
-        do not join: see `surface`.
+        F is the minimum of five planes: three through the edges, perpendicular to the triangle, and two at `thickness`
+        on either side of it. "literal" adds the quadrics to F, "clip" only to the outer plane. Patches of this field do
+        not join: see `surface`.
 
         Args:
             points: x [S, 3], or [B, S, 3] in B poses [m].
             patch: of each point, integers [S].
-            positions: vertices [B, V, 3] [m]; at rest when left out.
+            positions: vertices [B, V, 3] [m]; default at rest.
             reading: "clip" or "literal".
-            matrices: quadrics W [Q, 4, 4], or [B, Q, 4, 4] carried along with the poses, in place of those of the
-                patches: R_i = a_i [(x, 1)^T W_i (x, 1)]_+^3. Not only ellipsoids.
+            matrices: quadrics W [Q, 4, 4], or [B, Q, 4, 4] that follow the poses, in place of those of the patches:
+                R_i = a_i [(x, 1)^T W_i (x, 1)]_+^3. They need not be ellipsoids.
 
         Returns:
             F' [S] or [B, S] in m.
@@ -354,7 +354,7 @@ def _check_kind(name: str, value: Any, kind: type, source: str) -> None:
 
 
 def check_pose(pose: Any) -> None:
-    """Refuse what is no pose: a state, say, or its positions."""
+    """Refuse anything but a pose, such as a state or its positions."""
     _check_kind("pose", pose, PatchPose, "PatchBody.pose makes one of the positions of a state")
 
 
@@ -377,7 +377,7 @@ def _check_quadrics(quadrics: Quadrics, vertices: Tensor) -> None:
         )
 
 
-def _check_unique(pairs: Touching) -> None:
+def _check_unique(pairs: TouchingPairs) -> None:
     bad = np.flatnonzero(~(pairs.steepness < 1.0))
     if len(bad):
         raise ValueError(

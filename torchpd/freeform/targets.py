@@ -1,7 +1,7 @@
-"""What patches are fitted to: a mesh, a cloud of points, or a function that vanishes on a surface.
+"""Targets of a patch fit: a mesh, a cloud of points, or a function that vanishes on a surface.
 
-All answer the same question: the signed distance of points (negative inside), its direction, and the normal of the
-surface nearby. The rest follows by Newton's method.
+Each gives the signed distance of points (negative inside), its direction, and the normal of the surface nearby.
+Newton's method does the rest.
 """
 
 from __future__ import annotations
@@ -23,34 +23,43 @@ from ..geometry.mesh_checks import compact
 from ..geometry.tri_mesh import TriMesh
 from .checks import angle_weighted_normals, check_surface
 
-__all__ = ["CloudTarget", "FieldTarget", "FitTarget", "MeshTarget", "along", "base_triangles", "project", "target_of"]
+__all__ = [
+    "CloudTarget",
+    "FieldTarget",
+    "FitTarget",
+    "MeshTarget",
+    "base_triangles",
+    "intersect_lines",
+    "project",
+    "target_of",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Answer: TypeAlias = tuple[Array, Array, Array]
 
 _NAME = "FreeFormPatches.fit: target"
-_NEIGHBOURS = 16  # points of a cloud that make up the surface at a place
-_CELLS = 24  # of the lattice that finds the surface of a function or a cloud
+_NEIGHBOURS = 16  # points of a cloud that define the surface at a point
+_CELLS = 24  # cells of the lattice that finds the surface of a function or a cloud
 _FACING = 0.1  # least cosine between a director and the normal where it meets the surface
 
 
 class FitTarget(Protocol):
-    """A surface, as the fit sees it."""
+    """A target surface, as the fit sees it."""
 
-    size: float  # longest side of the box around it [m]
+    size: float  # longest side of the bounding box [m]
 
     def near(self, points: Array) -> Answer:
         """Signed distances [N] [m], their unit gradients [N, 3], and unit normals [N, 3] of the surface nearby."""
         ...
 
     def mesh(self) -> TriMesh:
-        """The surface as triangles, as fine as it is known or as a base may need."""
+        """The surface as triangles, as fine as known or as a base may need."""
         ...
 
 
 class MeshTarget:
-    """A triangle mesh; vertices in one place count as one. Its normals are those of the vertices, interpolated."""
+    """A triangle mesh; vertices at equal positions count as one. Its normals interpolate those of the vertices."""
 
     def __init__(self, surface: TriMesh) -> None:
         import trimesh
@@ -74,7 +83,7 @@ class MeshTarget:
         if self.shape.is_watertight and self.surface.volume() < 0:
             raise ValueError(
                 f"{_NAME} must have its triangles counter-clockwise seen from outside, got a closed surface of volume "
-                f"{self.surface.volume():.3g} m^3; turn them round (mesh.triangles[:, ::-1])"
+                f"{self.surface.volume():.3g} m^3; reverse them (mesh.triangles[:, ::-1])"
             )
         self.size = float(np.ptp(self.surface.bounds, axis=0).max())
         proximity: Any = trimesh.proximity
@@ -96,7 +105,7 @@ class MeshTarget:
         normals = _unit(np.einsum("nk,nkx->nx", share, self.vertex_normals.numpy()[corners]))
         apart = points - nearest
         flat = self.shape.face_normals[face]
-        # on the surface itself the offset has no direction, and off an edge the face is one of two
+        # on the surface the offset has no direction; beside an edge two faces are equally near
         side = np.where((apart * normals).sum(axis=1) < 0, -1.0, 1.0)
         on = distance <= 1e-9 * self.size
         gradient = np.where(on[:, None], flat, side[:, None] * apart / np.where(on, 1.0, distance)[:, None])
@@ -107,8 +116,8 @@ class MeshTarget:
 
 
 class FieldTarget:
-    """The zero surface of a smooth function, negative inside: its value over the length of its gradient is taken for
-    the distance, which is right to first order for any function, and exact for a distance."""
+    """The zero surface of a smooth function, negative inside. Value over gradient length estimates the distance: to
+    first order for any function, exact for a signed distance."""
 
     def __init__(self, function: Callable[[torch.Tensor], Any], bounds: Any) -> None:
         self.function = function
@@ -160,8 +169,8 @@ def _refuse_nonsense(points: Array, numbers: Array) -> None:
 
 
 class CloudTarget:
-    """Points with normals: the surface where the mean of the distances from planes through the points nearby vanishes,
-    weighted by [1 - |x - p|^2 / r^2]^3 (an implicit moving least-squares surface, Kolluri 2008; exact on spheres)."""
+    """Points with normals, as an implicit moving least-squares surface (Kolluri 2008; exact on spheres). It is the zero
+    set of the mean distance from planes through the points nearby, weighted by [1 - |x - p|^2 / r^2]^3."""
 
     def __init__(self, points: Any, normals: Any = None) -> None:
         self.points = as_array(_NAME, points, np.float64)
@@ -191,7 +200,7 @@ class CloudTarget:
         weight /= weight.sum(axis=1, keepdims=True)
         normal = self.normals[chosen[:, :-1]]
         mean = _unit(np.einsum("nk,nkx->nx", weight, normal))
-        # half way between both normals the plane through p meets a sphere again: no bias where the surface bends
+        # the plane through p half way between both normals meets a sphere again: no bias on curved surfaces
         planes = ((points[:, None] - self.points[chosen[:, :-1]]) * 0.5 * (normal + mean[:, None])).sum(axis=2)
         return (weight * planes).sum(axis=1), mean, mean
 
@@ -200,16 +209,16 @@ class CloudTarget:
 
 
 def _estimated_normals(points: Array, tree: cKDTree) -> Array:
-    """Normals of the planes through neighbours, turned alike along a tree of the least turns (Hoppe et al., 1992).
+    """Normals of planes through neighbours, oriented along a spanning tree of least turns (Hoppe et al. 1992).
 
-    Of each connected piece the highest point faces upwards.
+    The highest point of each connected component faces upwards.
     """
     chosen = tree.query(points, k=_NEIGHBOURS)[1]
     local = points[chosen] - points[chosen].mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nkx,nky->nxy", local, local))[1][:, :, 0]
     start = np.repeat(np.arange(len(points)), _NEIGHBOURS - 1)
     end = chosen[:, 1:].reshape(-1)
-    # 0 would be no edge at all
+    # a weight of 0 would be no edge
     cost = 1.0 - np.abs((normals[start] * normals[end]).sum(axis=1)) + 1e-6
     graph = coo_array((cost, (start, end)), shape=(len(points),) * 2).tocsr()
     graph = graph.maximum(graph.T)
@@ -241,7 +250,7 @@ def _contour(values: Callable[[Array], Array], low: Array, high: Array) -> TriMe
 
 
 def target_of(target: Any, normals: Any = None, bounds: Any = None, base: TriMesh | None = None) -> FitTarget:
-    """Whatever a user may fit to, as a target."""
+    """Convert any supported target of a fit to a `FitTarget`."""
     import trimesh
 
     if isinstance(target, (trimesh.Trimesh, trimesh.Scene)):
@@ -274,21 +283,23 @@ def _room(base: TriMesh) -> Array:
 
 
 def project(target: FitTarget, points: Array, steps: int = 8) -> Array:
-    """The points moved onto the surface, along the gradient of the distance."""
+    """Move the points onto the surface, along the gradient of the distance."""
     for _ in range(steps):
         distance, gradient, _ = target.near(points)
         points = points - distance[:, None] * gradient
     return points
 
 
-def along(target: FitTarget, points: Array, directions: Array, reach: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Where lines from points along directions [N, 3] meet the surface, from the inside to the outside.
+def intersect_lines(
+    target: FitTarget, points: Array, directions: Array, reach: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Intersect lines from points along directions [N, 3] with the surface, from the inside to the outside.
 
-    Newton's method for the distance along the line, exact on a plane.
+    Newton's method for the distance along the line; exact on a plane.
 
     Returns:
-        Signed places t [N] in units of the direction, normals there [N, 3], and where there is such a place within
-        |t| <= `reach`.
+        Signed parameters t [N] in units of the direction, normals there [N, 3], and whether there is an intersection
+        with |t| <= `reach`.
     """
     t = np.zeros(len(points))
     normals = np.zeros_like(points)
@@ -305,7 +316,7 @@ def along(target: FitTarget, points: Array, directions: Array, reach: Array) -> 
             break
         slope = (gradient * directions[active]).sum(axis=1)
         slope = np.copysign(np.maximum(np.abs(slope), 0.2 * length[active]), slope)
-        shift = distance / slope * (1.0 if step < 15 else 0.7)  # two faces may throw it to and fro
+        shift = distance / slope * (1.0 if step < 15 else 0.7)  # damped: it may oscillate between two faces
         t[active] = np.clip(t[active] - shift, -1.5 * reach[active], 1.5 * reach[active])
     distance = target.near(points[active] + t[active, None] * directions[active])[0]
     found[active[np.abs(distance) <= 1e-7 * target.size]] = True

@@ -1,8 +1,7 @@
 """Free-form patches as triangles: a barycentric grid on every patch, welded where patches meet.
 
-Grid points are numbered by what they lie on: a vertex, an edge and the step along it, a patch and the place inside.
-Patches that share an edge share the points on it, so the mesh has the Euler number of the base at every level, and no
-gaps.
+Grid points are numbered by their vertex, by their edge and position along it, or by their patch and position inside it.
+Patches share the points of their common edge. So the mesh has the Euler number of the base at every level, and no gaps.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Tessellation:
-    """A triangle mesh over patches. `patches.surface(samples, pose).points` are its vertices in a pose."""
+    """A triangle mesh over patches; `patches.surface(samples, pose).points` are its vertices in a pose."""
 
     patches: PatchSurface
     samples: PatchSamples  # one for each vertex
     triangles: Tensor  # int64 [T, 3]
 
     def mesh(self, pose: PatchPose | None = None) -> TriMesh:
-        """At rest, or in a pose of one environment."""
+        """The mesh at rest, or in a pose of one environment."""
         if pose is not None and len(pose.positions) != 1:
             raise ValueError(
                 f"Tessellation.mesh: pose must be of one environment, got {len(pose.positions)}; "
@@ -48,7 +47,7 @@ class Tessellation:
 
 
 def grid(level: int) -> tuple[Index, Index]:
-    """Steps from each corner [(m + 1)(m + 2)/2, 3], which add up to m, and triangles [m^2, 3] of one patch."""
+    """Barycentric grid of a patch: steps [(m + 1)(m + 2)/2, 3] that sum to m, and triangles [m^2, 3]."""
     steps = np.array([(level - r, r - c, c) for r in range(level + 1) for c in range(r + 1)])
     row = [r * (r + 1) // 2 for r in range(level + 2)]
     up = [(row[r] + c, row[r + 1] + c, row[r + 1] + c + 1) for r in range(level) for c in range(r + 1)]
@@ -69,7 +68,7 @@ def weld(elements: Index, vertices: int, steps: Index, level: int) -> Index:
     for k in range(3):
         number[:, steps[:, k] == level] = elements[:, [k]]
         on_side = (steps[:, (k + 2) % 3] == 0) & (steps[:, k] > 0) & (steps[:, (k + 1) % 3] > 0)
-        # counted from the end with the lower number, which both sides of the edge agree on
+        # counted from the end with the lower vertex number, which is the same for both sides of the edge
         forward = elements[:, [k]] == low[:, [k]]
         step = np.where(forward, steps[on_side, (k + 1) % 3], steps[on_side, k])
         number[:, on_side] = vertices + edge[:, [k]] * (level - 1) + step - 1

@@ -1,4 +1,4 @@
-"""How a pose carries free-form patches along: a frame for every vertex, from constraints of four vertices."""
+"""Transport of free-form patches by a pose: a frame for every vertex, from constraints of four vertices."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ class PatchTransport(nn.Module):
     """Carries patches along with their vertices and with apexes inside the body.
 
     Each patch has an apex, a point off its plane, which several patches may share. Corners and apex deform by
-    G = Ds Dm^-1; the frame of a vertex is the mean of G over the patches around it, weighted by area, after singular
-    values have been clamped and a last negative one has changed its sign. While nothing is clamped, an affine motion of
-    vertices and apexes carries the surface along exactly.
+    G = Ds Dm^-1, whose singular values are clamped, a negative last one with its sign changed. The frame of a vertex is
+    the mean of G over the patches around it, weighted by area. While nothing is clamped, an affine motion of vertices
+    and apexes carries the surface along exactly.
 
     Args:
-        patches: at rest. Their shape is a constant here, without a gradient.
-        apexes: points at rest [K, 3] [m], likewise.
-        apex: which of them each patch takes, integers [P]; one for each patch in order when left out.
+        patches: at rest. Their shape is a constant here, without gradient.
+        apexes: points at rest [K, 3] [m], also constant.
+        apex: the apex of each patch, integers [P]; default: one per patch, in order.
         mode: "transport" shears and stretches bumps with their surroundings, "rotation" keeps their shape.
-        stretch: the least and the largest singular value that a frame takes over.
+        stretch: least and largest singular value of a frame.
 
     Raises:
-        ValueError: an apex in the plane of its patch, or a number of apexes that does not fit.
+        ValueError: an apex in the plane of its patch, or a wrong number of apexes.
     """
 
     tets: Tensor
@@ -81,7 +81,7 @@ class PatchTransport(nn.Module):
         self.register_buffer("inverse_rest", inverse)
         self.register_buffer("areas", areas)
         self.register_buffer("rest_positions", rest)
-        nowhere = patches.samples(torch.empty(0, dtype=torch.int32), rest[:0])  # frames are asked for at no samples
+        nowhere = patches.samples(torch.empty(0, dtype=torch.int32), rest[:0])  # the op needs samples: none here
         self._lists = tuple(f"list_{number}" for number in range(len(patches.lists) + len(nowhere.lists)))
         for name, gathered in zip(self._lists, (*patches.lists, *nowhere.lists), strict=True):
             self.register_buffer(name, gathered, persistent=False)
@@ -95,10 +95,10 @@ class PatchTransport(nn.Module):
         """Clamped deformation gradients [B, P, 3, 3].
 
         Args:
-            positions: of vertices and apexes, in this order, [B, V + K, 3] [m].
-            fallback: what to take for constraints that have collapsed to a line or a point (second singular value
-                below 1e-4) or are not finite, [B, P, 3, 3]: the rotations of the local step, or the last gradients.
-                The nearest rotation when left out, which is then constant for derivatives.
+            positions: vertices, then apexes, [B, V + K, 3] [m].
+            fallback: [B, P, 3, 3], used for constraints that are not finite or have collapsed to a line or point
+                (second singular value below 1e-4): the rotations of the local step, or the last gradients. Default:
+                the nearest rotation, without gradient.
         """
         lower, upper = self.stretch
         G: Tensor = _ops.patch_deformation(
@@ -112,7 +112,7 @@ class PatchTransport(nn.Module):
         return nearest_rotation(A) if self.mode == "rotation" else A
 
     def forward(self, positions: Tensor, fallback: Tensor | None = None) -> PatchPose:
-        """The pose of the patches for positions [B, V + K, 3] of vertices and apexes [m]."""
+        """The pose of the patches for positions [B, V + K, 3] m of vertices and apexes."""
         frames = self.frames(self.gradients(positions, fallback))
         return PatchPose(positions[:, : self.vertices], frames)
 
@@ -133,7 +133,7 @@ def _tets(patches: PatchSurface, apex: Tensor | None, apexes: int) -> Index:
 
 
 def _rest_shape(rest: Tensor, tets: Index) -> tuple[Tensor, Tensor]:
-    """Dm^-1 [P, 3, 3] in 1/m and areas [P] in m^2, found in float64."""
+    """Dm^-1 [P, 3, 3] in 1/m and areas [P] in m^2, computed in float64."""
     corners = rest.double().cpu()[torch.as_tensor(tets)]
     edges = (corners[:, 1:] - corners[:, :1]).mT
     cross = torch.linalg.cross(edges[..., 0], edges[..., 1])

@@ -1,7 +1,7 @@
-"""Rules for vmap of the ops of free-form patches.
+"""vmap rules for the ops of free-form patches.
 
-A mapped dimension of a pose, of points or of quadrics' matrices joins the leading batch that these ops have. Whatever
-has no batch of its own, such as the surface at rest or a gradient summed over poses, is computed one by one.
+A mapped dimension of a pose, of points or of quadric matrices joins the leading batch of the op. Arguments without a
+batch, such as the surface at rest or a gradient summed over poses, are computed one by one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _ops = torch.ops.torchpd
 
 def _refuse_mapped_lists(dims: Any) -> None:
     if any(dim is not None for dim in dims):
-        raise ValueError("torchpd: the lists of patches cannot be mapped by vmap; they are the same for all")
+        raise ValueError("torchpd: lists of patches must be the same for all under vmap, got mapped ones")
 
 
 def _one_by_one(op: Any) -> Rule:
@@ -41,7 +41,7 @@ def _one_by_one(op: Any) -> Rule:
 
 
 def _joined(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
-    """The mapped dimension and the batch as one; what all maps share is repeated."""
+    """Merge the mapped dimension into the batch; shared tensors are repeated."""
     if tensor is None:
         return None
     whole = tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
@@ -49,7 +49,7 @@ def _joined(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
 
 
 def _with_batch(op: Any, batched: Sequence[int], *, grown: Callable[..., Any] | None = None) -> Rule:
-    """A rule for an op whose arguments number `batched` have a batch; one by one where another one is mapped."""
+    """A rule for an op whose arguments numbered `batched` have a batch; other mapped arguments run one by one."""
     single = _one_by_one(op)
 
     def rule(info: Any, in_dims: tuple[Any, ...], *args: Any, **options: Any) -> tuple[Any, int]:
@@ -72,7 +72,7 @@ def _with_batch(op: Any, batched: Sequence[int], *, grown: Callable[..., Any] | 
 
 
 def _field_matrices(joined: list[Any], args: tuple[Any, ...], in_dims: tuple[Any, ...], size: int) -> list[Any]:
-    """One set of matrices stays one; a mapped set is repeated for the poses of each map."""
+    """Keep one set of matrices; repeat a mapped set for the poses of each map."""
     matrices, dim, batch = args[3], in_dims[3], len(joined[0]) // size
     if dim is None and len(matrices) == 1:
         return joined[:3] + [matrices] + joined[4:]

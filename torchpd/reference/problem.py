@@ -1,14 +1,15 @@
-"""The oracle of every test: one step of projective dynamics in float64, plain NumPy and SciPy, nothing shared with C++.
+"""Reference for the tests: one step of projective dynamics in float64, plain NumPy and SciPy, no code shared with C++.
 
 The unknown is the displacement u = x - x_t of one step of length h. Every vertex effect folds into one weight a_i and
-one target s_i (implicit Euler in its variational form, Bouaziz et al. 2014; drag and soft pins are quadratic too):
+one target s_i. The step is the variational form of implicit Euler (Bouaziz et al. 2014); drag and soft pins are
+quadratic too:
 
     a_i     = m_i / h^2 (1 + damping h) + k_i
     a_i s_i = m_i / h^2 (h v_i + h^2 (g + f_i / m_i)) + k_i (target_i - x_t,i)
     E(u)    = sum_i a_i / 2 |u_i - s_i|^2 + sum_e w_e V_e / 2 |F_e(x_t + u) - R_e|^2
 
 with F = sum_a x_a (x) grad N_a and R its nearest rotation. Hard pins hold u_i = target_i - x_t,i and add nothing to E.
-What minimises E is in `reference_solvers`.
+`reference.solvers` holds the methods that minimise E.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Elements:
-    """What the rest shape alone says about every tetrahedron."""
+    """Geometry of the tetrahedra, computed from the rest shape."""
 
     rest_inverse: Array  # [E, 3, 3] Dm^-1, the columns of Dm being the edges x_1 - x_0, x_2 - x_0, x_3 - x_0 [1/m]
     volumes: Array  # [E] m^3
@@ -85,12 +86,12 @@ def singular_frames(matrices: Array) -> tuple[Array, Array, Array]:
 
 
 def nearest_rotation(matrices: Array) -> Array:
-    """The rotation R, det R = +1, that minimises |F - R| for every F [..., 3, 3]: U V^T of the signed SVD."""
+    """The nearest rotation of every F [..., 3, 3]: R with det R = +1 minimises |F - R|; U V^T of the signed SVD."""
     left, _, right = singular_frames(matrices)
     return left @ right
 
 
-# entries of a matrix, row by row, whose products are its cofactors
+# indices into a row-major 3x3 matrix: the products of these entries are its cofactors
 _NEXT, _LAST = (1, 2, 0), (2, 0, 1)
 _ENTRIES = [[3 * i + j for i in rows for j in columns] for rows, columns in
             ((_NEXT, _NEXT), (_LAST, _LAST), (_NEXT, _LAST), (_LAST, _NEXT))]  # fmt: skip
@@ -106,7 +107,7 @@ def nearest_rotation_fast(matrices: Array, *, sweeps: int = 9) -> Array:
     """`nearest_rotation` of F [n, 3, 3], about ten times faster where F is far from singular and not inverted.
 
     Higham's Newton iteration X <- (X + X^-T) / 2 converges quadratically to the rotation of the polar decomposition
-    when det F > 0 (Higham 1986). What has not converged to rounding is left to the SVD.
+    when det F > 0 (Higham 1986). The SVD handles matrices for which it has not converged to rounding.
     """
     x = np.ascontiguousarray(np.moveaxis(matrices, 0, 2))
     scale = np.abs(x).max(axis=(0, 1)) ** 3
@@ -118,7 +119,7 @@ def nearest_rotation_fast(matrices: Array, *, sweeps: int = 9) -> Array:
         determinants = (x[0] * cofactors[0]).sum(axis=0)
         following = 0.5 * (x + cofactors / determinants)
         change, x = np.abs(following - x).max(axis=(0, 1)), following
-        if change.max(initial=0.0) < 1e-9:  # quadratic: the error is now of the order of 1e-18
+        if change.max(initial=0.0) < 1e-9:  # quadratic convergence: the error is now of the order of 1e-18
             break
     rotations = np.ascontiguousarray(np.moveaxis(x, 2, 0))
     rest = ~sound | (change >= 1e-9)
@@ -143,7 +144,7 @@ class StepProblem:
 
     @cached_property
     def geometry(self) -> Elements:
-        """Of the rest shape."""
+        """Geometry of the tetrahedra at rest."""
         return elements(self.values.rest_positions, self.values.tets)
 
     @cached_property
@@ -214,7 +215,7 @@ class StepProblem:
         return self.evaluate(displacement)[1]
 
     def hessian(self, displacement: Array, *, positive: bool = False) -> csr_array:
-        """Exact Hessian [3V, 3V] (rows and columns of hard pins included), the derivative of the rotation in it.
+        """Exact Hessian [3V, 3V] N/m, with the derivative of the rotation; rows and columns of hard pins included.
 
         The derivative of |F - R|^2 / 2 is the identity less 2 / (s_i + s_j) on each twist
         U (e_i e_j^T - e_j e_i^T) V^T / sqrt 2 (Smith, De Goes and Kim 2019). `positive` clamps those eigenvalues,
@@ -225,7 +226,7 @@ class StepProblem:
         for i, j in ((0, 1), (1, 2), (2, 0)):
             twist = np.zeros((3, 3))
             twist[i, j], twist[j, i] = np.sqrt(0.5), -np.sqrt(0.5)
-            # the operator works on F^T, row by row
+            # the operator acts on F^T, row by row
             mode = np.swapaxes(left @ twist @ right, 1, 2).reshape(-1, 9)
             softening = 2.0 / np.maximum(values[:, i] + values[:, j], 1e-12)
             softening = np.minimum(softening, 1.0) if positive else softening
@@ -237,9 +238,11 @@ class StepProblem:
         return csr_array(diags_array(np.repeat(self.weight, 3)) + wide.T @ (inner @ wide))
 
     def first_iterate(self, start: str | Array = "velocity", *, weighted: bool = True) -> Array:
-        """u_0: "velocity" h v, "inertial" s, or positions [V, 3]; pins at their targets, contact, rigid motions.
+        """u_0 [V, 3] m with pins at their targets, contacts projected and rigid motions applied.
 
-        What planes would squeeze by more than it gains starts from where it is: `weighted` as the iterations are.
+        `start` is "velocity" (h v), "inertial" (s) or positions [V, 3]. With a named start, a component keeps its
+        current position where the contacts would squeeze it by more energy than the motion gains (`begin`).
+        `weighted` chooses the diagonal that the iterations use.
         """
         if isinstance(start, str):
             guesses = {"velocity": self.time_step * self.velocities, "inertial": self.target}
@@ -251,8 +254,8 @@ class StepProblem:
         guess = self.hold(np.asarray(start, dtype=np.float64) - self.positions)
         return self.project(guess, guess)
 
-    def course(self) -> Array:
-        """h v, on the pins and out of the contacts."""
+    def unsolved(self) -> Array:
+        """The unsolved step [V, 3] m: h v with pins at their targets and contacts projected."""
         guess = self.hold(self.time_step * self.velocities)
         return self.project(guess, guess)
 
@@ -260,20 +263,20 @@ class StepProblem:
         return np.where(self.free[:, None], displacement, self.target)
 
     def align(self, displacement: Array, *, first: bool = False) -> Array:
-        """Move every component as a rigid body to where E is least, as far as pins and contacts let it."""
+        """Move every component rigidly to the least E that its pins and contacts allow."""
         return align(self, displacement, nearest_rotation, first=first)
 
     def smallest_gap(self, displacement: Array) -> Array:
-        """Distance of every vertex to the nearest contact surface, negative inside [V]; inf without contacts."""
+        """Signed distance [V] m of every vertex to the nearest contact surface; inf without contacts."""
         positions = self.positions + displacement
         return gaps_of(positions, self.values.planes, self.sphere_centers, self.values.spheres)
 
     def project(self, displacement: Array, around: Array | None = None) -> Array:
-        """P(u): out of the planes one after another, then out of the spheres; hard pins stay.
+        """P(u) [V, 3] m: project out of the planes one after another, then out of the spheres; hard pins stay.
 
-        A sphere acts through its tangent half-space, whose normal is taken at `around` (at u itself by default). The
-        iterations pass the iterate from which the step was taken: with the normal of the raw step, the point where
-        friction comes to rest would depend on the length of the step.
+        A sphere acts through its tangent half-space, with the normal at `around` (by default at u). The iterations
+        pass their current iterate as `around`. With the normal of the unprojected step, the point where friction
+        comes to rest would depend on the step length.
         """
         moved = displacement
         for plane in self.values.planes:
@@ -290,15 +293,15 @@ class StepProblem:
         return np.where(self.free[:, None], moved, displacement)
 
     def residual(self, displacement: Array, diagonal: Array | None = None) -> Array:
-        """D (u - P(u - g / D)) [V, 3] in N: zero at a solution, grad E where nothing touches; D is Dbar by default."""
+        """D (u - P(u - g / D)) [V, 3] N: zero at a solution, grad E where nothing touches; D is Dbar by default."""
         scale = (self.weighted_diagonal if diagonal is None else diagonal)[:, None]
         stepped = displacement - self.gradient(displacement) / scale
         return np.asarray(scale * (displacement - self.project(stepped, displacement)))
 
     def relative_residual(self, displacement: Array, diagonal: Array | None = None) -> float:
-        """|r| / max(|f|, |r|), |f|^2 = sum_i |a_i (u_i - s_i)|^2 + |e_i|^2 of inertia, weight, springs and of elements.
+        """|r| / max(|f|, |r|), with |f|^2 = sum_i |a_i (u_i - s_i)|^2 + |e_i|^2 and e_i the elastic forces.
 
-        `Info.residual`, which takes off what rounding may be of r.
+        `Info.residual` is the same value less a bound of the rounding error of r.
         """
         left = float(np.linalg.norm(self.residual(displacement, diagonal)))
         pull = np.where(self.free[:, None], self.weight[:, None] * (displacement - self.target), 0.0)
@@ -307,7 +310,7 @@ class StepProblem:
 
 
 def _push_out(displacement: Array, normals: Array, gaps: Array, motion: Array, friction: float) -> Array:
-    """Move vertices with gap < 0 onto the surface, then take back slip up to friction times the depth (Coulomb)."""
+    """Move vertices with gap < 0 onto the surface, then undo slip up to friction times the depth (Coulomb)."""
     depth = np.maximum(-gaps, 0.0)
     moved = displacement + depth[:, None] * normals
     slip = moved - motion
@@ -331,14 +334,15 @@ def step_problem(
     """Build the minimisation of one step.
 
     Args:
-        values: of the scene.
-        positions: [V, 3] x_t.
-        velocities: [V, 3].
+        values: the scene.
+        positions: [V, 3] x_t, m.
+        velocities: [V, 3] m/s.
         time_step: h [s].
-        forces: [V, 3] in N, none by default.
-        pin_targets: [P, 3] in the order of values.pin_vertices, those of the scene by default.
-        sphere_centers: [S, 3] at the end of the step, those of the scene by default.
-        sphere_starts: [S, 3] at its beginning, those at the end by default; friction acts on the relative motion.
+        forces: [V, 3] N; default none.
+        pin_targets: [P, 3] m in the order of values.pin_vertices; default: those of the scene.
+        sphere_centers: [S, 3] m at the end of the step; default: those of the scene.
+        sphere_starts: [S, 3] m at the start of the step; default: `sphere_centers`. Friction acts on the relative
+            motion.
     """
     positions, velocities = np.asarray(positions, dtype=np.float64), np.asarray(velocities, dtype=np.float64)
     held, springs = values.pin_vertices, values.pin_stiffness
@@ -373,7 +377,7 @@ def step_problem(
 
 
 def elastic_energy(values: SceneValues, positions: Array) -> float:
-    """sum_e w_e V_e / 2 |F_e - R_e|^2 [J] at positions [V, 3]."""
+    """Elastic energy sum_e w_e V_e / 2 |F_e - R_e|^2 [J] at positions [V, 3]."""
     geometry = elements(values.rest_positions, values.tets)
     corners = positions[values.tets]
     deformation = np.einsum("eai,eaj->eij", corners, geometry.shape_gradients)
@@ -392,5 +396,5 @@ def potential_energy(values: SceneValues, positions: Array, *, pin_targets: Arra
 
 
 def kinetic_energy(values: SceneValues, velocities: Array) -> float:
-    """sum_i m_i / 2 |v_i|^2 [J]."""
+    """Kinetic energy sum_i m_i / 2 |v_i|^2 [J]."""
     return 0.5 * float(values.masses @ (velocities**2).sum(axis=1))

@@ -1,4 +1,4 @@
-"""A component of the oracle as a rigid body: what it weighs, how far it is from contacts, and turns of it."""
+"""One component of the reference as a rigid body: its weight, its distance to contacts, and its rotations."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..scene.scene import SceneValues
 __all__ = [
     "LYING",
     "NearestRotation",
-    "Piece",
     "Problem",
+    "RigidComponent",
     "axis_of",
+    "fraction_of",
     "gaps_of",
-    "part_of",
     "rotation_about",
     "turn_about",
 ]
@@ -26,12 +26,12 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 NORMAL, HEIGHT, FRICTION = (PLANES[name] for name in ("normal", "height", "friction"))
-LYING = 0.01  # of the way that a plane stops: a vertex lies on it that is no further off
-HALF_TURN = 1e-6  # 4 cos^2(angle / 2), at most, of what counts as half a turn
+LYING = 0.01  # a vertex lies on a plane when its gap is below this fraction of the displacement the plane stops
+HALF_TURN = 1e-6  # upper bound of 4 cos^2(angle / 2) for a rotation treated as a half turn
 
 
 class Problem(Protocol):
-    """What rigid motions take of a `StepProblem`, whose attributes these are."""
+    """The attributes of `StepProblem` that rigid motions read."""
 
     @property
     def values(self) -> SceneValues: ...
@@ -54,7 +54,7 @@ class NearestRotation(Protocol):
 
 
 def gaps_of(positions: Array, planes: Array, centers: Array, spheres: Array) -> Array:
-    """Distance of every position to the nearest of planes and spheres [n]; inf without any."""
+    """Signed distance [n] m of every position to the nearest plane or sphere; inf without any."""
     gaps = np.full(len(positions), np.inf)
     for plane in planes:
         gaps = np.minimum(gaps, positions @ plane[NORMAL] - plane[HEIGHT])
@@ -63,8 +63,8 @@ def gaps_of(positions: Array, planes: Array, centers: Array, spheres: Array) -> 
     return gaps
 
 
-class Piece:
-    """One component, its n vertices at y = x + u, their targets z = x + s."""
+class RigidComponent:
+    """One component: n vertices at y = x + u, with targets z = x + s."""
 
     def __init__(
         self, problem: Problem, displacement: Array, of: Mask, nearest_rotation: NearestRotation, first: bool
@@ -74,26 +74,26 @@ class Piece:
         self.u, self.weight = displacement[of], problem.weight[of, None]
         self.y, self.z = problem.positions[of] + self.u, problem.positions[of] + problem.target[of]
         share = self.weight / self.weight.sum()
-        self.middle, self.lag = (share * self.y).sum(axis=0), (share * (self.z - self.y)).sum(axis=0)
-        self.square = float((share * (self.y - self.middle) ** 2).sum())  # of its radius of gyration
-        self.covariance = self.about(self.middle + self.lag, self.middle)
+        self.centroid, self.target_offset = (share * self.y).sum(axis=0), (share * (self.z - self.y)).sum(axis=0)
+        self.gyration_squared = float((share * (self.y - self.centroid) ** 2).sum())  # squared radius of gyration
+        self.covariance = self.covariance_about(self.centroid + self.target_offset, self.centroid)
         self.pinned = ~problem.free[of]
         self.rest = problem.values.rest_positions[of]
-        self.comes = False  # its motion ends where it comes to a contact
+        self.meets_contact = False  # the motion ends at a contact
 
-    def about(self, goal: Array, pivot: Array) -> Array:
-        """Sum of a (z - goal) (y - pivot)^T."""
+    def covariance_about(self, goal: Array, pivot: Array) -> Array:
+        """Covariance [3, 3]: the sum of a (z - goal) (y - pivot)^T."""
         return np.asarray((self.weight * (self.z - goal)).T @ (self.y - pivot))
 
-    def gaps(self, positions: Array, planes: Array, *, balls: bool = True) -> Array:
-        spheres = self.problem.values.spheres if balls else np.zeros((0, 5))
+    def gaps(self, positions: Array, planes: Array, *, with_spheres: bool = True) -> Array:
+        spheres = self.problem.values.spheres if with_spheres else np.zeros((0, 5))
         return gaps_of(positions, planes, self.problem.sphere_centers[: len(spheres)], spheres)
 
-    def left(self, moved: Array, planes: Array) -> Array:
-        """Gaps after a motion. After the iterations 0 or less too where a ball could keep a vertex from that motion.
+    def gaps_after(self, moved: Array, planes: Array) -> Array:
+        """Gaps [n] m after a motion; after the first iterate, also 0 or less where a sphere could resist the motion.
 
-        That is with a force within the cone of its friction, if the vertex lies on it: balls curve away from what goes
-        along them. One ball alone holds nothing by friction that it does not push.
+        A sphere resists with a force inside its friction cone if the vertex lies on it, since its surface curves away
+        from tangential motion. A single sphere without normal force resists nothing by friction.
         """
         after, way, spheres = self.gaps(moved, planes), moved - self.y, self.problem.values.spheres
         if self.first:
@@ -110,12 +110,12 @@ class Piece:
             after = np.where(lies, np.minimum(after, across - several * sphere[SPHERES["friction"]] * along), after)
         return after
 
-    def gain(self, way: Array) -> float:
-        """What a motion by that [n, 3] adds to the energy."""
+    def energy_change(self, way: Array) -> float:
+        """Change of the energy [J] under a displacement [n, 3] m."""
         return float((0.5 * self.weight * ((self.y + way - self.z) ** 2 - (self.y - self.z) ** 2)).sum())
 
-    def share_to(self, planes: Array, free: Array) -> float:
-        """Of its free motion, that brings it to planes."""
+    def fraction_to(self, planes: Array, free: Array) -> float:
+        """Fraction of the free motion after which the component reaches the planes."""
         least = 1.0
         for plane in planes:
             before, after = (y @ plane[NORMAL] - plane[HEIGHT] for y in (self.y, free))
@@ -127,31 +127,34 @@ class Piece:
     def slips(self, normal: Array) -> Array:
         return np.asarray(self.u - np.outer(self.u @ normal, normal))
 
-    def way_on(self, planes: Array) -> Array:
-        """How far it goes along all planes that it touches [3]."""
+    def translation_along(self, planes: Array) -> Array:
+        """Displacement [3] m of the component along all planes that it touches."""
         normals, friction = planes[:, NORMAL], planes[:, FRICTION]
         _, sizes, directions = np.linalg.svd(normals)
         span = directions[: int((sizes > 1e-6).sum())]
-        along = self.lag - span.T @ (span @ self.lag)
+        along = self.target_offset - span.T @ (span @ self.target_offset)
         if not friction.any():
             return along if len(span) < 3 else np.zeros(3)
         if len(span) != len(planes) or len(span) > 2:
             return np.zeros(3)
-        if len(planes) == 1 and float(self.lag @ normals[0]) >= 0.0:
+        if len(planes) == 1 and float(self.target_offset @ normals[0]) >= 0.0:
             return np.asarray(along)
-        # how far the planes push it together, and the slips on those that are rough
-        pushes = np.linalg.solve(normals @ normals.T, -normals @ self.lag)
+        # normal displacements that the planes impose, and the slips on those with friction
+        pushes = np.linalg.solve(normals @ normals.T, -normals @ self.target_offset)
         if len(planes) > 1 and not (pushes > 0.0).all():
             return np.zeros(3)
         rough = [plane for plane in planes if plane[FRICTION] > 0.0]
-        lies = [self.y @ plane[NORMAL] - plane[HEIGHT] < -LYING * float(self.lag @ plane[NORMAL]) for plane in rough]
+        lies = [
+            self.y @ plane[NORMAL] - plane[HEIGHT] < -LYING * float(self.target_offset @ plane[NORMAL])
+            for plane in rough
+        ]
         slips = np.concatenate([self.slips(plane[NORMAL])[own] for plane, own in zip(rough, lies, strict=True)])
         if not len(slips):
             return np.zeros(3)
         mean = slips.mean(axis=0)
         if len(span) == 2:
             mean = mean - span.T @ (span @ mean)
-        # slips that differ leave a doubt about where friction acts: what is within it is left to the iterations
+        # where slips differ, the point at which friction acts is uncertain: the iterations resolve that part
         apart = 2.0 * float(np.linalg.norm(slips.max(axis=0) - slips.min(axis=0)))
         free, rub, slip = mean + along, float(friction @ pushes), float(np.linalg.norm(mean))
         left = float(np.linalg.norm(free)) - rub
@@ -168,14 +171,14 @@ def axis_of(matrix: Array) -> Array:
 
 
 def rotation_about(half: Array) -> Array:
-    """By Cayley's formula, about an axis by 2 atan(|v| / 2)."""
+    """Rotation about an axis by 2 atan(|v| / 2), v = `half`: Cayley's formula."""
     v = 0.5 * half
     skew = np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
     return np.asarray(np.eye(3) + 2.0 / (1.0 + v @ v) * (skew + skew @ skew))
 
 
-def part_of(turn: Array, share: float) -> Array:
-    """About that share of a turn: Cayley's vector of it times `share`; none of half a turn, which has no axis."""
+def fraction_of(turn: Array, share: float) -> Array:
+    """About the fraction `share` of a rotation: its Cayley vector times `share`; identity for a half turn (no axis)."""
     if share == 1.0:
         return turn
     left = 1.0 + float(np.trace(turn))
@@ -183,7 +186,7 @@ def part_of(turn: Array, share: float) -> Array:
 
 
 def turn_about(normal: Array, covariance: Array) -> Array:
-    """The rotation R about a normal that maximises tr(R^T covariance), by its angle."""
+    """The rotation R about a normal that maximises tr(R^T covariance)."""
     first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     first /= np.linalg.norm(first)
     frame = np.stack([first, np.cross(normal, first)])

@@ -1,4 +1,4 @@
-"""What minimises the energy of one step: the iterations of the library in float64, and solutions to rounding error."""
+"""Solvers for the energy of one step: the iterations of the library in float64, and solutions to rounding error."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ Observer = Callable[[int, Array], None]
 
 @dataclass
 class Iterates:
-    """The end of an iteration and what it went through."""
+    """Result of an iteration, with its history."""
 
-    displacement: Array  # [V, 3] u_K, aligned as the start was
+    displacement: Array  # [V, 3] u_K, m, after rigid alignment
     residual: float  # `StepProblem.relative_residual` of u_K, with the diagonal of the iteration
-    iterations: int  # carried out
-    restarts: list[int] = field(default_factory=list)  # iterations k whose check found the energy risen
+    iterations: int  # iterations done
+    restarts: list[int] = field(default_factory=list)  # iterations k at which the check found a higher energy
     energies: list[tuple[int, float]] = field(default_factory=list)  # (k, E(u_k)) at every check
     converged: bool = False  # stopped by the tolerance
 
 
 class _Plain:
-    """omega = 1: Jacobi iteration."""
+    """Jacobi iteration: omega = 1."""
 
     def omega(self, iteration: int) -> float:
         return 1.0
@@ -72,7 +72,7 @@ class _Classic:
 
 
 class _Guarded:
-    """Momentum kin / (kin + 3), up to the limit of Chebyshev's recurrence; it starts anew when the energy has risen."""
+    """Momentum age / (age + 3), up to the limit of Chebyshev's recurrence; restarts when the energy has risen."""
 
     def __init__(self, rho: float, tolerance: float) -> None:
         self.limit = ((1.0 - np.sqrt(1.0 - rho**2)) / rho) ** 2 if rho > 0.0 else 0.0
@@ -90,7 +90,7 @@ class _Guarded:
 
 
 def classic_omegas(rho: float, delay: int, iterations: int) -> list[float]:
-    """omega_0 .. omega_{K-1} of the classic schedule."""
+    """The weights omega_0 .. omega_{K-1} of the classic schedule."""
     schedule = _Classic(rho, delay)
     return [schedule.omega(k) for k in range(iterations)]
 
@@ -106,7 +106,7 @@ def _iterate(
     tolerance: float,
     observe: Observer | None,
 ) -> Iterates:
-    """u_{k+1} = P(u_{k-1} + omega_k (u_k - theta g / D - u_{k-1})), u_{-1} = u_0."""
+    """Run u_{k+1} = P(u_{k-1} + omega_k (u_k - theta g / D - u_{k-1})), u_{-1} = u_0."""
     result = Iterates(first, 1.0, 0)
     least = float((problem.weight / diagonal)[problem.free].min(initial=1.0))
     slowest, left = max(1.0 - relaxation * least, 0.0), 0.0
@@ -117,7 +117,7 @@ def _iterate(
         omega, coming = coming, schedule.omega(k + 1)
         if k % 4 == 0:
             result.energies.append((k, energy))
-            # acts on the omega after the next: the sums of one iteration are worked out during the next
+            # a restart acts on the omega after the next: a kernel reduces the sums of one iteration during the next
             if schedule.check(energy):
                 result.restarts.append(k)
         step = current - relaxation * gradient / diagonal[:, None]
@@ -137,11 +137,11 @@ def _iterate(
 
 
 def _error_left(change: float, before: float, slowest: float, omega: float) -> float:
-    """About |u - u*|, by the change of an iteration of weight omega and what was left before.
+    """Estimate |u - u*| [m] from the change of an iteration of weight omega and the previous estimate.
 
-    An iteration leaves |r| of the slowest mode, r the larger root of r^2 - omega g r + omega - 1, where one of Jacobi's
-    leaves g, and changes 1 - r of it where r is real. Where it is complex the mode swings and turns: what was left
-    before counts on, times |r|.
+    A Jacobi iteration damps the slowest mode by g = `slowest`. An iteration of weight omega damps it by |r|, with r the
+    larger root of r^2 - omega g r + omega - 1. If r is real, the change is 1 - r of the error. If r is complex, the
+    mode oscillates: the previous estimate, times |r|, is a lower bound.
     """
     square = (omega * slowest) ** 2 - 4.0 * (omega - 1.0)
     if square > 1e-6:
@@ -152,7 +152,7 @@ def _error_left(change: float, before: float, slowest: float, omega: float) -> f
 
 
 def _way(problem: StepProblem, displacement: Array) -> float:
-    """What elasticity and contacts have done, or gravity if that is more."""
+    """Scale of the relative error [m]: displacement by elasticity and contacts, or by gravity if larger."""
     fall = problem.time_step**2 * float(np.linalg.norm(problem.values.gravity)) * math.sqrt(len(displacement))
     return max(float(np.linalg.norm(displacement - problem.target)), fall)
 
@@ -167,7 +167,7 @@ def jacobi(
     tolerance: float = 0.0,
     observe: Observer | None = None,
 ) -> Iterates:
-    """Jacobi iteration; `observe(k, u_k)` sees every iterate from the first update on."""
+    """Jacobi iteration; `observe(k, u_k)` is called with every iterate from the first update on."""
     diagonal = problem.weighted_diagonal if weighted else problem.plain_diagonal
     return _iterate(problem, first, _Plain(), diagonal=diagonal, relaxation=relaxation, iterations=iterations,
                     tolerance=tolerance, observe=observe)  # fmt: skip
@@ -185,7 +185,7 @@ def classic_chebyshev(
     tolerance: float = 0.0,
     observe: Observer | None = None,
 ) -> Iterates:
-    """The accelerated iteration of the paper; rho estimates the spectral radius of the Jacobi iteration."""
+    """Classic Chebyshev iteration of the source paper; rho estimates the spectral radius of the Jacobi iteration."""
     diagonal = problem.weighted_diagonal if weighted else problem.plain_diagonal
     return _iterate(problem, first, _Classic(rho, delay), diagonal=diagonal, relaxation=relaxation,
                     iterations=iterations, tolerance=tolerance, observe=observe)  # fmt: skip
@@ -202,10 +202,10 @@ def guarded_chebyshev(
     tolerance: float = 0.0,
     observe: Observer | None = None,
 ) -> Iterates:
-    """The default scheme of the library; rho = min(0.99999, 1 - theta mu) unless given.
+    """Guarded Chebyshev, the library's default; rho = min(0.99999, 1 - theta mu) unless given.
 
-    It restarts when the energy has risen by more than the share `check_tolerance` in four iterations, see
-    `guard_tolerance`.
+    It restarts when the energy has risen by more than the fraction `check_tolerance` in four iterations (default:
+    `guard_tolerance`).
     """
     radius = min(0.99999, 1.0 - relaxation * problem.smallest_ratio if rho is None else rho)
     schedule = _Guarded(radius, guard_tolerance(problem) if check_tolerance is None else check_tolerance)
@@ -224,20 +224,23 @@ def preconditioned_lbfgs(
     backtrack: bool = False,
     observe: Observer | None = None,
 ) -> Array:
-    """L-BFGS from H_0 = relaxation M, two loops over its pairs (Nocedal 1980), in a step without contact.
+    """L-BFGS from H_0 = relaxation M, with the two-loop recursion (Nocedal 1980), in a step without contact.
 
-    Every iteration takes a full step. One that fails the decrease of Armijo, 1e-4, is an error, since what the library
-    then does is not textbook; or it is halved until it does not, and the iterations end where no step descends.
+    Every iteration takes a full step, and raises if the step fails Armijo's decrease of 1e-4: the library then departs
+    from the textbook method. With `backtrack` the step is halved instead; the iterations end where no step descends.
 
     Args:
         problem: the step.
-        first: u_0 [V, 3].
-        precondition: M of a gradient [V, 3], zero at hard pins.
-        iterations: to carry out.
-        relaxation: of M, in (0, 2).
-        memory: pairs that are kept, of those that saw positive curvature.
+        first: u_0 [V, 3] m.
+        precondition: applies M to a gradient [V, 3] that is zero at hard pins.
+        iterations: number of iterations.
+        relaxation: scale of M, in (0, 2).
+        memory: number of secant pairs kept, among those with positive curvature.
         backtrack: halve steps that fail.
-        observe: sees (k, u_k) from the first update on.
+        observe: called with (k, u_k) from the first update on.
+
+    Raises:
+        RuntimeError: a full step does not lower the energy enough, without `backtrack`.
     """
     u, pairs = first, list[tuple[Array, Array, float]]()
     energy, gradient = problem.evaluate(u)
@@ -258,7 +261,10 @@ def preconditioned_lbfgs(
             following = u - direction
             energy, gradient = problem.evaluate(following)
             if energy > last - 1e-4 * float(np.vdot(before, direction)) + 1e-12 * abs(last):
-                raise RuntimeError(f"preconditioned_lbfgs: iteration {k} fails to lower the energy enough")
+                raise RuntimeError(
+                    f"preconditioned_lbfgs: the full step of iteration {k} fails the Armijo decrease of 1e-4; "
+                    "pass backtrack=True"
+                )
         s, y = following - u, gradient - before
         curvature = float(np.vdot(s, y))
         if curvature > 0.0:
@@ -270,9 +276,9 @@ def preconditioned_lbfgs(
 
 
 def guard_tolerance(problem: StepProblem) -> float:
-    """Relative rise of the energy that is no reason to restart.
+    """Relative rise of the energy below which the iteration does not restart.
 
-    1e-5 for rounding. Sliding with friction does work that this energy does not contain: 1e-2 where there is friction.
+    1e-5 covers rounding. With friction it is 1e-2: sliding does work that this energy does not contain.
     """
     planes, spheres = problem.values.planes, problem.values.spheres
     friction = np.append(planes[:, PLANES["friction"]], spheres[:, SPHERES["friction"]])
@@ -280,12 +286,12 @@ def guard_tolerance(problem: StepProblem) -> float:
 
 
 def relative_error(displacement: Array, solution: Array, first: Array) -> float:
-    """|x - x*| / |x_0 - x*| over all vertices."""
+    """Relative error |x - x*| / |x_0 - x*| over all vertices."""
     return float(np.linalg.norm(displacement - solution) / np.linalg.norm(first - solution))
 
 
 def _force_scale(problem: StepProblem) -> float:
-    """|grad E(0)| [N]: all that is out of balance where the step starts; the size of inertia if that is nothing."""
+    """Scale of the forces |grad E(0)| [N] at the start of the step; that of inertia if it is zero."""
     start = float(np.linalg.norm(problem.gradient(problem.first_iterate(problem.positions))))
     return start if start > 0.0 else float(np.linalg.norm(problem.weight * problem.time_step**2))
 
@@ -302,15 +308,20 @@ def newton(
     iterations: int = 200,
     observe: Observer | None = None,
 ) -> Array:
-    """The minimiser near `first` of a step without contact: |grad E(u)| <= tolerance |grad E(0)|, then on to rounding.
+    """The minimiser [V, 3] m near `first` of a step without contact, to rounding error.
 
-    Stiff bodies almost at rest cannot have such a gradient; a step shorter than positions round ends there too.
+    It requires |grad E(u)| <= tolerance |grad E(0)|, then continues to rounding. A stiff body almost at rest cannot
+    reach such a gradient; a step shorter than the rounding of positions also ends the iteration.
 
-    Exact Hessian where its direction descends steeply enough, else the positive semidefinite one; backtracking on the
-    energy (Armijo, 1e-4), and on |grad E| once energies differ by rounding only.
+    The direction uses the exact Hessian if it descends steeply enough, else the positive semidefinite one. Backtracking
+    (Armijo, 1e-4) acts on the energy, and on |grad E| once energies differ only by rounding.
+
+    Raises:
+        ValueError: the scene has contacts.
+        RuntimeError: the tolerance was not reached.
     """
     if len(problem.values.planes) or len(problem.values.spheres):
-        raise ValueError("newton solves steps without contact; use solve_with_contact")
+        raise ValueError("problem must have no planes or spheres for newton; use solve_with_contact")
     u = problem.first_iterate() if first is None else first
     rows, scale = _free_rows(problem), _force_scale(problem)
     rounding = float(np.finfo(np.float64).eps * np.linalg.norm(problem.positions))
@@ -328,13 +339,15 @@ def newton(
         u, energy, gradient = trial, trial_energy, trial_gradient
         if observe is not None:
             observe(k + 1, u)
-    raise RuntimeError(f"newton: stopped at |grad E| = {size:.3e} N, wanted {tolerance * scale:.3e} N")
+    raise RuntimeError(
+        f"newton: |grad E| must fall to {tolerance * scale:.3e} N, got {size:.3e} N; raise iterations or tolerance"
+    )
 
 
 def newton_step(problem: StepProblem, displacement: Array) -> Array | None:
-    """Where the quadratic of E around u has its minimum, from u [V, 3] m: the first order of u* - u near a minimum.
+    """Newton step [V, 3] m from u: to first order u* - u near a minimum.
 
-    None where that is no way down.
+    None if the exact Hessian gives no descent direction.
     """
     gradient = problem.evaluate(displacement)[1]
     direction, own = _newton_direction(problem, displacement, gradient, _free_rows(problem))
@@ -344,7 +357,7 @@ def newton_step(problem: StepProblem, displacement: Array) -> Array | None:
 def _descend(
     problem: StepProblem, displacement: Array, energy: float, gradient: Array, direction: Array
 ) -> tuple[Array, float, Array]:
-    """Backtrack along a descent direction; without any descent the displacement itself comes back."""
+    """Backtrack along a descent direction; returns the displacement itself if no step descends."""
     slope, size, length = float((direction * gradient).sum()), float(np.linalg.norm(gradient)), 1.0
     while length > 1e-12:
         trial = displacement + length * direction
@@ -362,7 +375,7 @@ def _descend(
 def _newton_direction(
     problem: StepProblem, displacement: Array, gradient: Array, rows: NDArray[np.int64]
 ) -> tuple[Array, bool]:
-    """The step to the minimum of the quadratic; where that is no way down, of one that curves upwards, and False."""
+    """Newton direction and True; if it does not descend, that of the positive semidefinite Hessian and False."""
     flat = gradient.reshape(-1)[rows]
     direction = np.zeros(gradient.size)
     for positive in (False, True):
@@ -376,10 +389,13 @@ def _newton_direction(
 def solve_with_contact(
     problem: StepProblem, first: Array | None = None, *, tolerance: float = 1e-12, iterations: int = 20000
 ) -> Array:
-    """The fixed point of the guarded scheme: |r(u)| <= tolerance |grad E(0)|, r as in `StepProblem.residual`.
+    """The fixed point [V, 3] m of the guarded scheme: |r(u)| <= tolerance |grad E(0)|, r as in `StepProblem.residual`.
 
-    Exact Coulomb friction: there the contact forces (n, t) of a slipping vertex satisfy |t| = friction |n|, t against
-    the displacement, whatever the length of the step that is projected.
+    Friction is exact Coulomb friction there. The contact force (n, t) of a slipping vertex satisfies
+    |t| = friction |n|, with t against the displacement, for any length of the projected step.
+
+    Raises:
+        RuntimeError: the tolerance was not reached.
     """
     u = problem.first_iterate() if first is None else first
     scale = _force_scale(problem)
@@ -388,7 +404,9 @@ def solve_with_contact(
         size = float(np.linalg.norm(problem.residual(u)))
         if size <= tolerance * scale:
             return u
-    raise RuntimeError(f"solve_with_contact: {iterations} iterations leave |r| = {size:.3e} N")
+    raise RuntimeError(
+        f"solve_with_contact: |r| = {size:.3e} N after {iterations} iterations; raise iterations or tolerance"
+    )
 
 
 def spectrum(problem: StepProblem, *, weighted: bool = False) -> tuple[float, float]:

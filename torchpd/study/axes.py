@@ -1,4 +1,4 @@
-"""The measurements of a study, each axis by itself: what the solver, the time step, the mesh and float32 get wrong."""
+"""The measurements of a study, one axis at a time: errors of the solver, the time step, the mesh and float32."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-_REPEATS = 3  # of a method of the literature
+_REPEATS = 3  # runs of a published method
 _MEMORY_ITERATIONS = 3
 _NEWTON_ITERATIONS = 25
 
-# The tests of the source paper: constraints and milliseconds of 64 iterations on a GTX 470, and cells of a bar with as
-# many tetrahedra (6 a cell; 1008 and 198 are as near as a bar comes to 1000 and 200).
+# Tests of the source paper: constraints, milliseconds of 64 iterations on a GTX 470, and cells of a bar with about as
+# many tetrahedra (6 per cell; 1008 and 198 are the bars nearest to 1000 and 200).
 PAPER_TESTS = ((1200, 27.0, (8, 5, 5)), (1000, 26.0, (7, 6, 4)), (200, 20.0, (11, 3, 1)))
 
 
@@ -78,7 +78,7 @@ def contender_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting
 
 
 def _judged(rows: list[Row]) -> list[Row]:
-    """Rows of one method by iterations, each with the status that it has among them."""
+    """Rows of one method, ordered by iterations, with their status."""
     if not rows:
         return []
     energies = [row.error_energy for row in rows]
@@ -87,7 +87,7 @@ def _judged(rows: list[Row]) -> list[Row]:
 
 
 def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) -> list[Row]:
-    """A method of the literature at several iteration counts, against the converged step."""
+    """A published method at several iteration counts, against the converged step."""
     _, exact = bench.hard_step(setting)
     method = BASELINES[name]
     most = min(max(counts), _NEWTON_ITERATIONS) if method.few else max(counts)
@@ -114,7 +114,7 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
 
 
 def _shown(trace: Trace, counts: list[int], *, every: bool) -> list[int]:
-    """Iterations that become rows: those of the other methods and the last, or each where there are few."""
+    """Iterations that become rows: those of the other methods and the last; all of them if `every`."""
     wanted = set(trace.displacements) - {0} if every else {*counts, trace.last}
     return sorted(k for k in wanted if 0 < k <= trace.last)
 
@@ -132,7 +132,7 @@ def _baseline_row(traces: list[Trace], iterations: int, errors: tuple[float, ...
 def dense_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, counts: list[int]) -> list[Row]:
     """The direct global step on the device at several iteration counts, against the converged step.
 
-    Its set-up is the inverse. That it takes to estimate rho, in NumPy, is not counted.
+    The set-up time is that of the inverse. The estimate of rho, in NumPy, is not timed.
     """
     _, exact = bench.hard_step(setting)
     problem = exact.problem
@@ -176,7 +176,7 @@ def stiffness_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting
 
 @torch.no_grad()
 def float_rows(bench: Bench, setting: Setting, counts: list[int]) -> list[Row]:
-    """Distance of float32 from float64 at the same iterations of the default, relative to |u_0 - u*|."""
+    """Distance of float32 from float64 at equal iterations of the default solver, relative to |u_0 - u*|."""
     state, exact = bench.hard_step(setting)
     rows = []
     sims = [bench.simulator(setting, dtype) for dtype in (torch.float32, torch.float64)]
@@ -201,7 +201,7 @@ def float_rows(bench: Bench, setting: Setting, counts: list[int]) -> list[Row]:
     return _judged(rows)
 
 
-# ---- time step and mesh: whole motions, solved so well that nothing else matters
+# ---- time step and mesh: whole motions, solved so far that only one error remains
 
 
 @dataclass(frozen=True)
@@ -209,11 +209,11 @@ class _Motion:
     setting: Setting
     vertices: int
     steps: int
-    way: Array  # of the probes, x_T - x_0 [n, 3] m
+    displacement: Array  # [n, 3] m of the probes, x_T - x_0
     energy: float  # at the end, J
-    brought: float  # kinetic energy at the start, J
-    seconds: float  # that it took
-    solved: bool  # every step of it
+    initial_kinetic: float  # kinetic energy at the start, J
+    seconds: float  # wall time
+    solved: bool  # every step was solved
 
 
 @torch.no_grad()
@@ -229,26 +229,29 @@ def _motion(bench: Bench, setting: Setting, steps: int) -> _Motion:
     positions = end.positions[0].cpu().numpy()
     seconds = clock() - begin
     mesh = bench.mesh(setting.resolution)
-    places = [bench.subject.probes(mesh, x) for x in (state.positions[0].cpu().numpy(), positions)]
-    brought = float(sim.energy(state)[0] - sim.energy(state.positions)[0])
-    way = places[1] - places[0]
-    return _Motion(setting, sim.vertices, steps, way, float(sim.energy(end)[0]), brought, seconds, solved)
+    places = [bench.study_scene.probes(mesh, x) for x in (state.positions[0].cpu().numpy(), positions)]
+    initial_kinetic = float(sim.energy(state)[0] - sim.energy(state.positions)[0])
+    displacement = places[1] - places[0]
+    return _Motion(
+        setting, sim.vertices, steps, displacement, float(sim.energy(end)[0]), initial_kinetic, seconds, solved
+    )
 
 
 def _motion_rows(bench: Bench, axis: str, runs: list[tuple[Setting, int]]) -> list[Row]:
-    """Errors of whole motions against the last of them: of the way of the probes, and of the energy at the end."""
+    """Errors of whole motions against the last one: of the displacement of the probes and of the final energy."""
     *motions, exact = [_motion(bench, setting, steps) for setting, steps in runs]
     rows = []
     for motion in motions:
-        setting, off = motion.setting, motion.way - exact.way
+        setting, off = motion.setting, motion.displacement - exact.displacement
         rows.append(
             Row(
                 axis=axis, method="solved", status="ok" if motion.solved and exact.solved else "uncertain",
                 iterations=motion.steps, youngs=setting.youngs, time_step=setting.time_step,
                 vertices=motion.vertices, tets=len(bench.mesh(setting.resolution).tets),
-                error=float(np.linalg.norm(off) / np.linalg.norm(exact.way)),
+                error=float(np.linalg.norm(off) / np.linalg.norm(exact.displacement)),
                 error_metres=float(np.linalg.norm(off, axis=1).max()),
-                error_energy=abs(motion.energy - exact.energy) / exact.brought, milliseconds=1e3 * motion.seconds,
+                error_energy=abs(motion.energy - exact.energy) / exact.initial_kinetic,
+                milliseconds=1e3 * motion.seconds,
                 more={"resolution": float(setting.resolution), "seconds_of_motion": motion.steps * setting.time_step},
             )
         )  # fmt: skip
@@ -256,7 +259,7 @@ def _motion_rows(bench: Bench, axis: str, runs: list[tuple[Setting, int]]) -> li
 
 
 def time_step_rows(bench: Bench, setting: Setting, halvings: int, *, finer: int = 3) -> list[Row]:
-    """The motion of six time steps, done again with steps of half the length, against 2^finer times shorter ones."""
+    """The motion of six time steps, repeated with halved steps, against steps shorter by 2^finer."""
     lengths = [*range(halvings), halvings - 1 + finer]
     return _motion_rows(
         bench,
@@ -277,7 +280,7 @@ def mesh_rows(bench: Bench, setting: Setting, resolutions: tuple[int, ...]) -> l
 
 
 def paper_rows(bench: Bench) -> list[Row]:
-    """A step of as many tetrahedra as the paper's tests have constraints, with its 64 iterations, in float32."""
+    """A float32 step of as many tetrahedra as the paper's tests have constraints, with its 64 iterations."""
     rows = []
     for constraints, theirs, cells in PAPER_TESTS:
         mesh = shapes.box((1.0, 0.2, 0.2), cells)

@@ -1,4 +1,4 @@
-"""The workbench of a study: a subject compiled as asked for, its converged steps, and clocks for both."""
+"""The test bench of a study: a study scene compiled on request, its converged steps, and timers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ..geometry.tet_mesh import TetMesh
 from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver
 from ..simulation.state import State
 from .results_log import Row, Trajectory
-from .scenes import Subject
+from .scenes import StudyScene
 
 __all__ = [
     "Bench",
@@ -38,23 +38,23 @@ __all__ = [
     "verdicts",
 ]
 
-# of steps that only the time step, the mesh or another solver's error may spoil, and the solvers that are tried
+# steps of which only one error is measured are solved by these, in turn
 SOLVED = 1e-9
 _SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 300), (Chebyshev(), 3000))
-_DOUBTFUL = 0.1  # uncertainty of the converged step over the error that is measured from it
-_UNSEEN = 1e-8  # errors below are in no figure and no table
-_SCATTER = 1.3  # 95th over 5th percentile, of a machine that does something else too
-_LOWER = 1e-6  # energy below that of the converged step, relative to the first iterate's: more than rounding
-_DIVERGED = 2.0  # times as far from the converged step as the first iterate
+_DOUBTFUL = 0.1  # limit of the uncertainty of the converged step, over the error measured against it
+_UNSEEN = 1e-8  # smaller errors appear in no figure or table
+_SCATTER = 1.3  # 95th over 5th percentile of times on a machine that is busy with other work
+_LOWER = 1e-6  # energy below that of the converged step, over the first iterate's, that exceeds rounding
+_DIVERGED = 2.0  # distance from the converged step, over that of the first iterate
 
 
 class UncertainWarning(UserWarning):
-    """A step has no converged answer that errors could be measured against."""
+    """Warning: a step has no converged solution to measure errors against."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is studied at once: a body of some stiffness and resolution, and a time step."""
+    """What one task studies: the stiffness and resolution of a body, and a time step."""
 
     youngs: float  # Pa
     time_step: float  # s
@@ -63,61 +63,61 @@ class Setting:
 
 @dataclass
 class Bench:
-    """Compiles the subject and keeps what several tasks need."""
+    """Compiles the study scene and keeps results that several tasks share."""
 
-    subject: Subject
+    study_scene: StudyScene
     device: torch.device
-    series: int = 6  # of times, where they scatter
-    seconds: float = 0.05  # of each of them, at least
+    series: int = 6  # series of times, if they scatter
+    seconds: float = 0.05  # least duration of a series
     _meshes: dict[int, TetMesh] = field(default_factory=dict)
     _steps: dict[Setting, tuple[State, ExactStep]] = field(default_factory=dict)
-    motions: dict[tuple[Setting, float], Trajectory] = field(default_factory=dict)  # converged, by their seconds
+    motions: dict[tuple[Setting, float], Trajectory] = field(default_factory=dict)  # converged motions, by duration
 
     def mesh(self, resolution: int) -> TetMesh:
-        """Of the subject."""
+        """The mesh of the study scene at a resolution."""
         if resolution not in self._meshes:
-            self._meshes[resolution] = self.subject.mesh(resolution)
+            self._meshes[resolution] = self.study_scene.mesh(resolution)
         return self._meshes[resolution]
 
     def simulator(
         self, setting: Setting, dtype: torch.dtype, solver: Solver | None = None, **options: Any
     ) -> Simulator:
-        """A new one on the device."""
-        scene = self.subject.scene(self.mesh(setting.resolution), setting.youngs)
+        """A new simulator on the device."""
+        scene = self.study_scene.scene(self.mesh(setting.resolution), setting.youngs)
         chosen = {"iterations": DEFAULT_ITERATIONS, "batch": 1, **options}
         sim = Simulator(scene, setting.time_step, solver=solver, dtype=dtype, progress=False, **chosen)
         return sim.to(self.device)
 
     def start(self, sim: Simulator) -> State:
-        """The beginning of the motion in the precision of the simulator, as float32 holds it."""
-        state = self.subject.start(sim)
+        """The initial state in the precision of the simulator, rounded to float32."""
+        state = self.study_scene.start(sim)
         return State(*(part.float().to(sim.dtype) for part in state))
 
     def time(self, work: Callable[[], object]) -> Timing:
-        """Of a call."""
+        """Time a call."""
         return time_calls(work, self.device, seconds=self.seconds, series=self.series)
 
     @torch.no_grad()
     def hard_step(self, setting: Setting) -> tuple[State, ExactStep]:
-        """A state within the motion, rounded to float32 but in float64, and the converged step from there."""
+        """A float64 state within the motion, rounded to float32, and the converged step from it."""
         if setting not in self._steps:
             sim = self.simulator(setting, torch.float64, Chebyshev(), iterations=1000, tolerance=1e-9)
             state = self.start(sim)
-            for _ in range(self.subject.steps_before):
+            for _ in range(self.study_scene.steps_before):
                 state = sim(state)
             state = State(*(part.float().double() for part in state))
             exact = exact_steps(sim, state)[0]
             self._steps[setting] = (state, exact)
             if exact.uncertainty > _DOUBTFUL * _UNSEEN:
                 warn_user(
-                    f"study: the converged step at {setting.youngs:g} Pa may itself be wrong by "
+                    f"study: the converged step at {setting.youngs:g} Pa has an uncertainty of "
                     f"{exact.uncertainty:.1e}: rows with errors up to ten times that are marked uncertain",
                     UncertainWarning,
                 )
         return self._steps[setting]
 
     def solver(self, name: str, setting: Setting) -> tuple[Solver, float]:
-        """A contender for the hard step, and the milliseconds that choosing its parameters took."""
+        """A candidate solver for the hard step, and the milliseconds taken to choose its parameters."""
         sim = self.simulator(setting, torch.float64)
         state, _ = self.hard_step(setting)
         clock = clock_of(self.device)
@@ -136,7 +136,7 @@ class Timing:
 
     @classmethod
     def of(cls, seconds: list[float]) -> Timing:
-        """Percentiles of measured times."""
+        """Percentiles of measured times [s]."""
         p5, median, p95 = np.percentile(np.array(seconds) * 1e3, [5, 50, 95]).tolist()
         return cls(median, p5, p95)
 
@@ -146,12 +146,12 @@ class Timing:
         return self.p95 / self.p5
 
     def columns(self) -> dict[str, Any]:
-        """As a row has them."""
+        """The timing columns of a row."""
         return {"milliseconds": self.median, "milliseconds_p5": self.p5, "milliseconds_p95": self.p95}
 
 
 def clock_of(device: torch.device) -> Callable[[], float]:
-    """Seconds: with one thread on the CPU those of the processor, which others on the machine hardly disturb."""
+    """A clock in seconds; with one CPU thread it counts processor time, which other load hardly affects."""
     alone = device.type == "cpu" and torch.get_num_threads() == 1
     return time.process_time if alone else time.perf_counter
 
@@ -159,9 +159,9 @@ def clock_of(device: torch.device) -> Callable[[], float]:
 def time_calls(
     work: Callable[[], object], device: torch.device, *, least: int = 7, seconds: float = 0.05, series: int = 1
 ) -> Timing:
-    """At least so many calls and so much time; the first call is not counted.
+    """Time at least `least` calls and `seconds`; the first call is not counted.
 
-    Where times scatter, somebody else used the machine: up to `series` are measured, and the steadiest one counts.
+    Scattered times mean other load on the machine: up to `series` series are measured, and the steadiest one is used.
     """
     clock = clock_of(device)
     work()
@@ -184,7 +184,7 @@ def _wait_for(device: torch.device) -> None:
 
 
 def count_kernels(work: Callable[[], object], device: torch.device) -> int | None:
-    """Kernels that a call launches on a GPU, by the profiler; None on the CPU, which has none."""
+    """Number of kernels that a call launches on a GPU, from the profiler; None on the CPU."""
     if device.type != "cuda":
         return None
     work()
@@ -199,7 +199,7 @@ def count_kernels(work: Callable[[], object], device: torch.device) -> int | Non
 
 
 class PeakMemory:
-    """Of what runs between making and reading this: what the allocator of a GPU has seen, or what the layout says."""
+    """Peak memory between construction and `read`: from the GPU allocator, or computed from the layout on the CPU."""
 
     def __init__(self, device: torch.device, layout: int) -> None:
         self._device, self._layout = device, layout
@@ -208,7 +208,7 @@ class PeakMemory:
             torch.cuda.reset_peak_memory_stats(device)
 
     def read(self) -> tuple[int, str]:
-        """Bytes, and how they are known."""
+        """Bytes, and how they were found."""
         if self._device.type != "cuda":
             return self._layout, "layout"
         _wait_for(self._device)
@@ -216,20 +216,20 @@ class PeakMemory:
 
 
 def precision_name(dtype: torch.dtype) -> str:
-    """float32 or float64."""
+    """Return "float32" or "float64"."""
     return str(dtype).removeprefix("torch.")
 
 
 def verdicts(errors: Sequence[float], uncertainty: float = 0.0, energies: Sequence[float | None] = ()) -> list[str]:
-    """The status of each row of a method, in the order of iterations: diverged is what stays far off to the end.
+    """The status of each row of a method, ordered by iterations.
 
-    Far off may be the first iterates of a method that descends in energy. Errors that the uncertainty of the converged
-    step is more than a tenth of are uncertain, and those that it may explain too. So is all where any iterate has less
-    energy than the converged step: that is another minimum then, and not the lowest.
+    "diverged": the error stays large to the end; early iterates of a method that descends in energy may be far off.
+    "uncertain": the uncertainty of the converged step exceeds a tenth of the error, or could explain it. All rows are
+    uncertain if an iterate has less energy than the converged step, which then is not the lowest minimum.
     """
     if any(energy is not None and energy < -_LOWER for energy in energies):
         return ["uncertain" if math.isfinite(error) else "diverged" for error in errors]
-    # the least error from here on
+    # the smallest error from here on
     best = [*accumulate(reversed([e if math.isfinite(e) else math.inf for e in errors]), min)][::-1]
     found = []
     for error, least in zip(errors, best, strict=True):
@@ -244,9 +244,9 @@ def verdicts(errors: Sequence[float], uncertainty: float = 0.0, energies: Sequen
 
 @torch.no_grad()
 def solved_step(sim: Simulator, state: State) -> tuple[State, bool]:
-    """A step in float64, solved until about 1e-9 of its way is left; and whether that was reached.
+    """A step in float64, solved to a relative error of about 1e-9, and whether that was reached.
 
-    By Multilevel, and by Chebyshev, which goes on from there where that fails.
+    Multilevel solves it; where it fails, Chebyshev continues.
     """
     sim.tolerance = SOLVED
     guess: str | torch.Tensor = "velocity"
@@ -271,7 +271,7 @@ def measure_step(
     more: dict[str, float] | None = None,
     **columns: Any,
 ) -> Row:
-    """One solver at one iteration count on a step whose converged end is known: errors, times, memory, kernels."""
+    """A row for one solver at one iteration count: errors against the known solution, times, memory, kernels."""
     sim.iterations = iterations
     given = State(*(part.to(sim.dtype) for part in state))
     after = sim(given)

@@ -1,4 +1,4 @@
-"""How fast the solvers come near the converged step: error against iterations, measured and drawn."""
+"""Convergence of the solvers to the converged step: error against iterations, measured and drawn."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from ..simulation.state import State
 
 __all__ = ["ConvergenceCurve", "SolvedAlreadyError", "compare_solvers", "measure_convergence", "plot_convergence"]
 
-# Okabe and Ito's palette, told apart with every kind of colour vision.
+# Okabe and Ito's palette, distinct under every kind of colour blindness
 _COLORS = ("#8a8d93", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
 
 
-_DOUBTFUL = 1e-6  # uncertainty of the converged step, of the error that errors are relative to
+_DOUBTFUL = 1e-6  # uncertainty of the converged step, in the unit of the errors, above which a warning is given
 
 
 class SolvedAlreadyError(ValueError):
-    """The step has nothing to measure: its first iterate is its solution."""
+    """The step leaves nothing to measure: its first iterate is its solution."""
 
 
 @dataclass(frozen=True)
 class ConvergenceCurve:
-    """Error of one solver in one time step, |x - x*| / |x_0 - x*|: x* the converged step, x_0 = x + h v."""
+    """Error |x - x*| / |x_0 - x*| of one solver in one time step; x* is the converged step, x_0 = x + h v."""
 
     solver: Solver
     iterations: tuple[int, ...]
-    errors: tuple[float, ...]  # inf where the iteration left the range of numbers
+    errors: tuple[float, ...]  # inf where the iteration overflowed
 
 
 @torch.no_grad()
@@ -46,15 +46,19 @@ def measure_convergence(
 ) -> dict[str, ConvergenceCurve]:
     """Error against iterations of each solver in one step from `state`, in float64 and without friction.
 
-    Where vertices stick, every position inside the cone of friction is a solution, and each solver stops at another
-    one: their distance would say nothing about either.
+    With friction a sticking vertex has many solutions, all positions inside its friction cone, and each solver stops at
+    another one. Their distance would measure neither.
 
     Args:
-        sim: the scene and its time step; its own solver and precision do not matter.
-        state: where the step starts, [1, V, 3].
-        solvers: by the name that they shall have in the answer.
-        iterations: up to how many, at about thirty counts.
-        progress: show a bar.
+        sim: the scene and its time step; its own solver and precision are ignored.
+        state: the start of the step, [1, V, 3].
+        solvers: the solvers, by their name in the result.
+        iterations: the largest of about thirty iteration counts.
+        progress: show a progress bar.
+
+    Raises:
+        ValueError: the state holds several environments.
+        SolvedAlreadyError: the first iterate is the solution.
     """
     if len(state.positions) != 1:
         raise ValueError(f"measure_convergence: state must hold one environment, got {len(state.positions)}")
@@ -69,12 +73,12 @@ def measure_convergence(
     exact = exact_steps(study, start)[0]
     if exact.uncertainty > _DOUBTFUL:
         warn_user(
-            f"measure_convergence: the converged step is uncertain by {exact.uncertainty:.1g}, in the unit of the "
-            "curves, which below that say nothing"
+            f"measure_convergence: the converged step has an uncertainty of {exact.uncertainty:.1g} in the unit of the "
+            "curves; ignore errors below it"
         )
     solution = start.positions + torch.from_numpy(exact.solution).to(start.positions.device)
     scale = exact.scale
-    # rounded positions strain a body a little, even one that only falls
+    # rounding of positions strains a body slightly, even in free fall
     rounding = 10.0 * torch.finfo(state.positions.dtype).eps * float(start.positions.norm())
     if float((after(Chebyshev(), 0) - solution).norm()) <= rounding:
         raise SolvedAlreadyError("measure_convergence: the first iterate solves this step already (free fall, or rest)")
@@ -104,7 +108,7 @@ def compare_solvers(
 
 
 def _study(sim: Simulator, solver: Solver) -> Simulator:
-    """The same scene without friction, in float64."""
+    """A simulator of the same scene without friction, in float64."""
     scene = scene_without_friction(sim.scene)
     return Simulator(scene, sim.time_step, sim.iterations, solver, dtype=torch.float64, progress=False).to(sim.device)
 
@@ -119,8 +123,8 @@ def plot_convergence(
     """Draw the curves into a picture file.
 
     Args:
-        curves: from `measure_convergence`; the last one is drawn strongest.
-        path: of the picture.
+        curves: from `measure_convergence`; the last one is emphasised.
+        path: the picture file.
         title: one line above the plot.
         mark: number of iterations to mark by a vertical line, for example those of a run.
     """
@@ -131,7 +135,7 @@ def plot_convergence(
     lowest = min(min(curve.errors) for curve in curves.values())
     for number, (name, curve) in enumerate(curves.items()):
         last = number == len(curves) - 1
-        errors = np.minimum(curve.errors, 30.0)  # a diverging curve leaves through the top of the plot
+        errors = np.minimum(curve.errors, 30.0)  # a diverging curve leaves the plot at the top
         axes.plot(
             (0, *curve.iterations),
             (1.0, *errors),

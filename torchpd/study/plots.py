@@ -1,4 +1,4 @@
-"""Pictures of a study (matplotlib): error against time, each axis by itself, and what it does to a motion."""
+"""Pictures of a study (matplotlib): error against time, each axis by itself, and the effect on a motion."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ __all__ = [
 
 TOP = 2.0  # where a failure is drawn: above the first iterate, whose error is 1
 _LOWEST = 1e-7
-# Okabe and Ito's palette, told apart with every kind of colour vision: ours in strong colours and full lines, methods
-# of the literature in thin ones, which are dashed where Python takes much of their time.
+# Okabe and Ito's palette, distinct under every kind of colour blindness. Solvers of this library have strong colours
+# and full lines; published methods have thin lines, dashed where Python takes much of their time.
 STYLES: dict[str, tuple[str, float, str]] = {
     DEFAULT: ("#d55e00", 2.8, "solid"),
     "classic Chebyshev": ("#0072b2", 2.0, "solid"),
@@ -49,22 +49,22 @@ STYLES: dict[str, tuple[str, float, str]] = {
     "L-BFGS": ("#7d3c98", 1.2, "dashed"),
     "L-BFGS with A^-1": ("#7d3c98", 1.2, "solid"),
 }
-_OTHER = ("#b0447b", 2.0, "solid")  # of a solver that has joined since
-_LABELS = {  # of methods on a GPU
+_OTHER = ("#b0447b", 2.0, "solid")  # solvers without a style above
+_LABELS = {  # methods on a GPU
     "direct global step, dense": "direct global step, dense inverse (cuBLAS, float32)",
     "direct global step + Chebyshev, dense": "direct global step + Chebyshev, dense inverse (cuBLAS, float32)",
 }
 _INK, _PAPER_GRID = "#3e4046", "#e4e5e8"
-# left out of the picture of all methods, where it would lie beside Jacobi's curve; the report has it
+# left out of the picture of all methods, where their curves coincide with Jacobi's; the report shows them
 _REPEATED = ("damped Jacobi",)
 
 
-# what the theory has for an axis: the power, and its name
+# the theoretical slope of an axis: the power, and its name
 SLOPES = {"time step": (1.0, "order one in h"), "mesh": (-2.0 / 3.0, "order two in the edge")}
 
 
 def axis_label(name: str) -> str:
-    """What an axis of a figure says."""
+    """Label of a figure's axis."""
     return {
         "error": "error of the step, |x − x*| / |x₀ − x*|",
         "milliseconds": "time of a step [ms]",
@@ -73,12 +73,12 @@ def axis_label(name: str) -> str:
 
 
 def in_words(row: Row) -> str:
-    """A method of the literature, and what it runs in where its name does not say so."""
+    """A published method with the language it runs in, unless its name says so."""
     return row.method if "NumPy" in row.method else f"{row.method} (float64: {row.parts or 'NumPy'})"
 
 
 def pareto_front(rows: list[Row]) -> list[Row]:
-    """Points that no other one beats in both error and milliseconds, by time. Failures are never among them."""
+    """Points that no other point beats in both error and milliseconds, by time; failures are excluded."""
     sound = [row for row in rows if row.status == "ok" and row.milliseconds is not None]
     front: list[Row] = []
     for row in sorted(sound, key=lambda row: (row.milliseconds or 0.0, row.error)):
@@ -88,15 +88,15 @@ def pareto_front(rows: list[Row]) -> list[Row]:
 
 
 def curves_of(rows: list[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
-    """Rows by their key, each in the order of iterations."""
+    """Rows by their key, each ordered by iterations."""
     found: dict[Any, list[Row]] = {}
     for row in rows:
         found.setdefault(key(row), []).append(row)
     return {name: sorted(group, key=lambda row: row.iterations) for name, group in found.items()}
 
 
-def draw_study(rows: list[Row], out: Path, *, subject: str) -> list[Path]:
-    """Write the pictures that the rows have data for."""
+def draw_study(rows: list[Row], out: Path, *, scene_name: str) -> list[Path]:
+    """Write the pictures for which the rows have data."""
     drawers: dict[str, tuple[tuple[str, ...], Callable[[list[Row], Path, str], Path]]] = {
         "solver.png": (("solver",), _draw_solvers),
         "stiffness.png": (("stiffness",), _draw_stiffness),
@@ -108,7 +108,7 @@ def draw_study(rows: list[Row], out: Path, *, subject: str) -> list[Path]:
     for name, (axes, draw) in drawers.items():
         chosen = [row for row in rows if row.axis in axes]
         if chosen:
-            written.append(draw(chosen, out / name, subject))
+            written.append(draw(chosen, out / name, scene_name))
     return written
 
 
@@ -132,14 +132,14 @@ def _error_axis(axis: Any, errors: list[float], label: str) -> None:
 
 
 def _drawn(rows: list[Row]) -> list[float]:
-    """Errors as they are drawn: failures at the top, what is below the paper on its edge."""
+    """Plotted errors: failures at the top, values below the axis on its edge."""
     return [min(max(row.error, _LOWEST), TOP) for row in rows]
 
 
 def _mark_failures(axis: Any, xs: Sequence[float | None], rows: list[Row], color: str) -> None:
-    """Crosses at the top, and rings around errors that nobody knows."""
+    """Draw crosses at the top, and rings around uncertain errors."""
     failed = [x for x, row in zip(xs, rows, strict=True) if row.failed]
-    if failed:  # an empty line that is not clipped has no bounds, which upsets the layout
+    if failed:  # an empty unclipped line has no bounds, which breaks the layout
         axis.plot(failed, [TOP] * len(failed), "x", color=color, markersize=7, markeredgewidth=2, zorder=5)
     pairs = [(x, y) for x, y, row in zip(xs, _drawn(rows), rows, strict=True) if row.status == "uncertain"]
     if pairs:
@@ -147,24 +147,24 @@ def _mark_failures(axis: Any, xs: Sequence[float | None], rows: list[Row], color
 
 
 def _note_uncertain(figure: Any, rows: list[Row]) -> None:
-    """Says below the panels what rings are."""
+    """Explain the rings below the panels."""
     if any(row.status == "uncertain" for row in rows):
-        figure.supxlabel("rings: uncertain, no converged answer is known to compare with", fontsize=9, color="#b3261e")
+        figure.supxlabel("rings: uncertain, no converged step is known well enough", fontsize=9, color="#b3261e")
 
 
 # ---- all solvers
 
 
 def _shown(rows: list[Row]) -> dict[str, list[Row]]:
-    """Curves of the picture: ours in float32, methods of the literature in float64."""
+    """Curves of the picture: this library in float32, published methods in float64."""
     chosen = [row for row in rows if row.method not in _REPEATED and (row.precision == "float32" or not row.compiled)]
     return dict(curves_of(chosen, lambda row: row.method))
 
 
-def _draw_solvers(rows: list[Row], path: Path, subject: str) -> Path:
+def _draw_solvers(rows: list[Row], path: Path, scene_name: str) -> Path:
     first = rows[0]
     figure, (left, right) = _figure(
-        2, f"{subject}: {max(row.tets for row in rows):,} tetrahedra, Young's modulus {_pascals(first.youngs)}, "
+        2, f"{scene_name}: {max(row.tets for row in rows):,} tetrahedra, Young's modulus {_pascals(first.youngs)}, "
         f"time step {first.time_step:.3g} s. One step.", width=6.6,
     )  # fmt: skip
     curves, refused = _shown(rows), dict[str, list[str]]()
@@ -209,7 +209,7 @@ def _mark_default(left: Any, right: Any, rows: list[Row]) -> None:
 
 
 def float32_floor(rows: list[Row]) -> float | None:
-    """Error that the default has in float32 after the most iterations, where float64 has less than half of it."""
+    """Error of the default in float32 after the most iterations, if float64 has less than half of it; else None."""
     last = {row.precision: row for row in sorted(rows, key=lambda row: row.iterations) if row.method == DEFAULT}
     single, double = last.get("float32"), last.get("float64")
     if single is None or double is None or single.iterations != double.iterations:
@@ -218,7 +218,7 @@ def float32_floor(rows: list[Row]) -> float | None:
 
 
 def _mark_floor(axis: Any, rows: list[Row]) -> None:
-    """Where float32 levels off, if it does within the study."""
+    """Mark where float32 levels off, if it does within the study."""
     floor = float32_floor(rows)
     if floor is not None:
         axis.axhline(floor, color="#d55e00", linewidth=1.2, linestyle="dotted", label="float32 levels off")
@@ -230,10 +230,10 @@ def _mark_floor(axis: Any, rows: list[Row]) -> None:
 _SHADES = ("#56b4e9", "#0072b2", "#002b4d")  # soft to stiff
 
 
-def _draw_stiffness(rows: list[Row], path: Path, subject: str) -> Path:
+def _draw_stiffness(rows: list[Row], path: Path, scene_name: str) -> Path:
     rows = [row for row in rows if row.precision == "float64"]
     methods = list(dict.fromkeys(row.method for row in rows))
-    figure, axes = _figure(len(methods), f"{subject}: error of one step at three stiffnesses, float64", width=5.6)
+    figure, axes = _figure(len(methods), f"{scene_name}: error of one step at three stiffnesses, float64", width=5.6)
     stiffnesses = sorted({row.youngs for row in rows})
     shades = dict(zip(stiffnesses, _SHADES, strict=False))
     for axis, method in zip(axes, methods, strict=True):
@@ -253,15 +253,15 @@ def _draw_stiffness(rows: list[Row], path: Path, subject: str) -> Path:
     return path
 
 
-def _draw_cost(rows: list[Row], path: Path, subject: str) -> Path:
-    """The default and `Multilevel` in float32, error against milliseconds: what a user pays for accuracy."""
+def _draw_cost(rows: list[Row], path: Path, scene_name: str) -> Path:
+    """Error against milliseconds of the default and `Multilevel` in float32: the cost of accuracy for users."""
     from matplotlib.ticker import FuncFormatter
 
     own = [row for row in rows if row.precision == "float32" and row.milliseconds is not None]
     if not own:
         return path
     first = own[0]
-    title = f"{subject}, {first.tets:,} tetrahedra, float32: what accuracy costs on this machine"
+    title = f"{scene_name}, {first.tets:,} tetrahedra, float32: cost of accuracy on this machine"
     figure, (axis,) = _figure(1, title, width=8.2)
     shades = dict(zip(sorted({row.youngs for row in own}), _SHADES, strict=False))
     methods = list(dict.fromkeys(row.method for row in own))
@@ -301,7 +301,7 @@ def _draw_cost(rows: list[Row], path: Path, subject: str) -> Path:
 
 
 def _pascals(youngs: float) -> str:
-    """10 kPa rather than 10000 Pa."""
+    """Format Young's modulus: 10 kPa rather than 10000 Pa."""
     for factor, unit in ((1e9, "GPa"), (1e6, "MPa"), (1e3, "kPa")):
         if youngs >= factor:
             return f"{youngs / factor:g} {unit}"
@@ -311,8 +311,8 @@ def _pascals(youngs: float) -> str:
 # ---- time step, mesh, float32
 
 
-def _draw_axes(rows: list[Row], path: Path, subject: str) -> Path:
-    figure, axes = _figure(3, f"{subject}: the other errors, each by itself (everything else {_how_solved(rows)})")
+def _draw_axes(rows: list[Row], path: Path, scene_name: str) -> Path:
+    figure, axes = _figure(3, f"{scene_name}: the other errors, each by itself (everything else {_how_solved(rows)})")
     by_axis = curves_of(rows, lambda row: row.axis)
     _panel(
         axes[0], by_axis.get("time step", []), lambda row: 1e3 * row.time_step, "time step [ms]",
@@ -343,7 +343,7 @@ def _panel(
     *,
     slope: tuple[float, str] | None,
 ) -> None:
-    """Error against one quantity, with the slope that the theory has for it."""
+    """Error against one quantity, with its theoretical slope."""
     sound = [row for row in rows if 0.0 < row.error < math.inf]
     axis.set_title(title, fontsize=10, loc="left")
     axis.set_xlabel(label)
@@ -368,7 +368,7 @@ def _panel(
         axis.legend(frameon=False)
     axis.set_xscale("log")
     axis.set_yscale("log")
-    # marks at what was measured; the small marks of a short logarithmic axis would overlap
+    # ticks at the measured values; minor ticks of a short logarithmic axis would overlap
     shown = xs if len(xs) <= 6 else xs[::3]
     axis.set_xticks(shown, [f"{x:,.0f}" if x >= 100.0 else f"{x:.3g}" for x in shown])
     axis.set_xticks([], minor=True)
@@ -377,17 +377,17 @@ def _panel(
     axis.set_ylabel("relative error of positions")
 
 
-# ---- what it does to a motion
+# ---- effect on a motion
 
 
-def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
+def _draw_trajectory(rows: list[Row], path: Path, scene_name: str) -> Path:
     stiffest = max(row.youngs for row in rows)
     curves = curves_of([row for row in rows if row.youngs == stiffest], lambda row: row.method)
     shown = [row for curve in curves.values() for row in curve]
     own = curves.get(DEFAULT) or next(iter(curves.values()))
     seconds = own[0].more["seconds_of_motion"]
     figure, (left, right) = _figure(
-        2, f"{subject}: {seconds:g} s of motion at a Young's modulus of {_pascals(own[0].youngs)}, against the "
+        2, f"{scene_name}: {seconds:g} s of motion at a Young's modulus of {_pascals(own[0].youngs)}, against the "
         "converged motion",
         width=6.2,
     )  # fmt: skip
@@ -397,16 +397,14 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
         label = f"{name}: mean of its steps" if "tolerance" in curve[0].more else name
         left.plot(counts, _drawn(curve), marker="o", color=color, linewidth=width, linestyle=dash, label=label)
         _mark_failures(left, counts, curve, color)
-    _error_axis(
-        left, [row.error for row in shown], "largest distance from the converged path,\nover the length of the way"
-    )
-    left.set_title("how far the body is from where it should be", fontsize=10, loc="left")
+    _error_axis(left, [row.error for row in shown], "largest distance from the converged path,\nover the displacement")
+    left.set_title("distance of the body from its converged path", fontsize=10, loc="left")
     xs = [row.iterations for row in own]
     names = {
-        "softness": ("too far out: false softness", "#0072b2"),
-        "energy": ("energy at the end: above 0 out of nothing", "#009e73"),
+        "softness": ("overshoot: false softness", "#0072b2"),
+        "energy": ("energy at the end: above 0 it grew", "#009e73"),
         "growth": ("highest energy above the start", "#cc79a7"),
-        "turn": ("time of the first turn", "#e69f00"),
+        "turn": ("time of the first turning point", "#e69f00"),
     }
     for name, (label, color) in names.items():
         values = [row.more.get(name) for row in own]
@@ -416,7 +414,7 @@ def _draw_trajectory(rows: list[Row], path: Path, subject: str) -> Path:
     right.set_yscale("symlog", linthresh=1e-3)
     right.axhline(0.0, color=_INK, linewidth=0.8)
     right.set_ylabel("relative to the converged motion;\nenergies over the kinetic energy of the start")
-    right.set_title(f"and what that looks like: {own[0].method}", fontsize=10, loc="left")
+    right.set_title(f"its effect on the motion: {own[0].method}", fontsize=10, loc="left")
     left.legend(frameon=False, fontsize=9)
     right.legend(frameon=False, fontsize=9)
     _note_uncertain(figure, shown)

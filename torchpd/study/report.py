@@ -1,4 +1,4 @@
-"""The report of a study: one HTML file with interactive figures that works without a network (plotly)."""
+"""The report of a study: one HTML file with interactive figures (plotly) that needs no network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["write_report"]
 _OTHER = ("#56b4e9", 2.0, "solid")
 _COLORS = ("#d55e00", "#0072b2", "#56b4e9")  # the stiffness of the study first, then softer ones
 _SYMBOLS = {"diverged": "x", "uncertain": "circle-open"}  # circles for the others
-_LOWEST_POWER = -8  # of ten, of the errors that are shown at first
+_LOWEST_POWER = -8  # power of ten at the bottom of the error axis
 # columns of the table of all rows, and the fields of `Row` that they show
 _COLUMNS = {
     "axis": "axis", "method": "method", "precision": "precision", "iterations": "iterations",
@@ -43,12 +43,12 @@ details summary { cursor: pointer; margin-top: 2em }
 <body>
 <h1>What accuracy costs: {{ record.subject }}</h1>
 <p>Errors are |x &minus; x*| / |x<sub>0</sub> &minus; x*| of one time step: 1 is the first iterate, 0 the
-converged step. Thick lines are the solvers of this library; thin ones are methods of the literature: on a
-GPU dense inverses in cuBLAS, on the CPU, in float64, methods on the compiled local step of this library
-(C++) but for those with NumPy in their names. What is around that step is in brackets. Full lines are
-compiled in nearly all that takes time; dashed ones spend much of it in Python: their iterations compare
-exactly, their milliseconds are upper bounds. Failures are crosses at the top; rings are uncertain, for want
-of a converged step to compare with; what is refused has not run. Click a name in a legend to hide it.</p>
+converged step. Thick lines are the solvers of this library; thin ones are published methods. On a GPU those are
+dense inverses in cuBLAS. On the CPU they run in float64 on the compiled local step of this library (C++), except
+those with NumPy in their names; brackets name the rest of their code. Full lines are compiled in nearly all parts
+that take time; dashed ones spend much of it in Python. Their iterations compare exactly, their milliseconds are
+upper bounds. Crosses at the top are failures. Rings are uncertain: no converged step is known well enough.
+Refused methods did not run. Click a name in a legend to hide it.</p>
 <pre>{{ record.command }}</pre>
 {% set machine = record.machine -%}
 <p>{{ machine.cpu }}, {{ machine.threads }} thread{{ "s" * (machine.threads > 1) }}, {{ machine.simd }}; device:
@@ -83,10 +83,9 @@ commit {{ record.commit[:12] }}, {{ record.created }}</p>
 def write_report(rows: list[Row], record: dict[str, Any], path: Path) -> Path:
     """Write the report.
 
-    Args:
-        rows: of the study.
-        record: command, machine, versions and subject, as in study.json.
-        path: of the file.
+    rows: rows of the study.
+    record: command, machine, versions and subject, as in study.json.
+    path: the HTML file.
     """
     plotly = optional_module("plotly.io", "plotly", "reports", "study")
     jinja = optional_module("jinja2", "jinja2", "reports", "study").Environment(autoescape=True)
@@ -107,7 +106,7 @@ def write_report(rows: list[Row], record: dict[str, Any], path: Path) -> Path:
 
 
 def _shown(value: Any) -> str:
-    """Of a cell: numbers to three digits, whole ones in full."""
+    """Text of a cell: numbers to three digits, integers in full."""
     if isinstance(value, float):
         return f"{value:.3g}" if math.isfinite(value) else ""
     return f"{value:,}" if isinstance(value, int) else str(value or "")
@@ -119,7 +118,7 @@ Figure = tuple[str, str, Any]
 
 
 def _figures(rows: list[Row]) -> list[Figure]:
-    """Title, words and figure of everything that the rows have data for."""
+    """Title, text and figure for every part that the rows have data for."""
     by_axis = curves_of(rows, lambda row: row.axis)
     found = []
     if "solver" in by_axis:
@@ -141,9 +140,9 @@ def _figures(rows: list[Row]) -> list[Figure]:
         "time step": "Whole motions, solved to 1e-9, against 8 times shorter steps.",
         "mesh": "Whole motions on coarser meshes, against the finest one.",
         "float": "The same iterations in both precisions, relative to |x<sub>0</sub> &minus; x*|.",
-        "trajectory": "Largest distance from the converged path over the way; hover for softness and energy. "
-        "Full lines are the default solver, dashed ones Multilevel: as many iterations for each step, or those that a "
-        "tolerance asks for.",
+        "trajectory": "Largest distance from the converged path over the displacement; hover for softness and energy. "
+        "Full lines are the default solver, dashed ones Multilevel, with a fixed number of iterations per step or with "
+        "a tolerance.",
     }
     for axis, title, place, label in others:
         if axis in by_axis:
@@ -183,7 +182,7 @@ def _trace(rows: list[Row], place: Callable[[Row], float | None], name: str, sty
 
 
 def _words(row: Row) -> str:
-    """What a point says when it is pointed at."""
+    """Hover text of a point."""
     number = ("error", "uncertainty", "error_energy", "error_metres", "residual", "milliseconds", "milliseconds_p5",
               "milliseconds_p95", "setup_milliseconds", "bytes", "kernels", "local_steps")  # fmt: skip
     values = [(name, getattr(row, name)) for name in number] + list(row.more.items())

@@ -1,4 +1,4 @@
-"""Records of a study: motions, and rows that survive an interruption, one line of JSON for every finished task."""
+"""The results log of a study: rows and motions, kept as one line of JSON per finished task."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Ledger", "Row", "Trajectory", "write_csv"]
+__all__ = ["ResultsLog", "Row", "Trajectory", "write_csv"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Row:
-    """One point of a study. Numbers that do not apply are None; an error of a failure is inf."""
+    """One point of a study. Numbers that do not apply are None; the error of a failure is inf."""
 
-    axis: str  # whose error: "solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper"
+    axis: str  # the error studied: "solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper"
     method: str
-    status: str = "ok"  # else "diverged", "uncertain", or "refused: " and why
+    status: str = "ok"  # or "diverged", "uncertain", or "refused: " and the reason
     precision: str = "float64"
-    compiled: bool = True  # a solver of this library, throughout C++; else `parts` says what is
-    parts: str = ""  # what a method of the literature runs in: "C++" is the local step of this library
+    compiled: bool = True  # a solver of this library, all in C++; otherwise `parts` names the languages
+    parts: str = ""  # languages of a published method: "C++" is the local step of this library
     iterations: int = 0
     local_steps: int | None = None  # evaluations of all rotations
     youngs: float = 0.0  # Pa
@@ -36,46 +36,46 @@ class Row:
     vertices: int = 0
     tets: int = 0
     error: float = math.inf  # relative, of positions
-    uncertainty: float | None = None  # of what the error is measured against, relative as the error
+    uncertainty: float | None = None  # of the reference solution, in the unit of the error
     error_energy: float | None = None  # relative
-    error_metres: float | None = None  # largest of a vertex
+    error_metres: float | None = None  # largest error of a vertex
     residual: float | None = None
     milliseconds: float | None = None  # median
     milliseconds_p5: float | None = None
     milliseconds_p95: float | None = None
-    setup_milliseconds: float | None = None  # once a scene or step, beside `milliseconds`
+    setup_milliseconds: float | None = None  # once per scene or step, not part of `milliseconds`
     bytes: int | None = None
     bytes_by: str | None = None  # "layout" (computed), "tracemalloc" or "torch.cuda" (measured peak)
     kernels: int | None = None  # launched, on a GPU
-    default: bool = False  # what `Simulator(scene)` does
+    default: bool = False  # the default of `Simulator(scene)`
     more: dict[str, float] = dataclasses.field(default_factory=dict)
 
     @property
     def refusal(self) -> str | None:
-        """Why nothing was run, in a few words; None for what ran, however badly."""
+        """The reason in a few words why nothing was run; None for rows that ran."""
         verdict, _, why = self.status.partition(": ")
         return why.split(";")[0] if verdict == "refused" else None
 
     @property
     def failed(self) -> bool:
-        """Whether it diverged: what is uncertain may be as good as it says."""
+        """Return whether it diverged; an uncertain row may be correct."""
         return self.status == "diverged"
 
     def reaches(self, goal: float) -> bool:
-        """Whether the error is below a goal for sure."""
+        """Return whether the error is certainly below a goal."""
         return self.error + (self.uncertainty or 0.0) <= goal
 
     def may_reach(self, goal: float) -> bool:
-        """Whether the error may be below a goal."""
+        """Return whether the error may be below a goal."""
         return self.error - (self.uncertainty or 0.0) <= goal
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values; JSON has no infinity, which becomes null."""
+        """Plain values for JSON, in which infinity becomes null."""
         return {name: _without_infinity(value) for name, value in dataclasses.asdict(self).items()}
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Row:
-        """What `to_json` gave."""
+        """Read the result of `to_json`."""
         return cls(**{**record, "error": math.inf if record["error"] is None else record["error"]})
 
 
@@ -87,28 +87,31 @@ def _without_infinity(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A motion, sampled at every time step, the start first."""
+    """A motion, sampled after every time step; the start comes first."""
 
     time_step: float  # s
     probes: Array  # [T + 1, n, 3] m
     energies: Array  # [T + 1] mechanical, J
-    brought: float  # kinetic energy at the start, J
-    milliseconds: float  # a step, mean
-    solved: bool = True  # every step of it, where that was asked for
-    iterations: float = math.nan  # of a step, mean, where it was not
+    initial_kinetic: float  # kinetic energy at the start, J
+    milliseconds: float  # mean per step
+    solved: bool = True  # every step was solved, where requested
+    iterations: float = math.nan  # mean per step, where not requested
 
 
-class Ledger:
+class ResultsLog:
     """Finished tasks in a file, for a study with the given settings.
 
     Args:
-        path: of the file; made when missing.
-        settings: that all rows depend on. A file of other settings is refused, lest two studies mix.
+        path: the file; it is created if missing.
+        settings: all settings that rows depend on. A file with other settings is refused, so that studies never mix.
+
+    Raises:
+        ValueError: the file holds a study with other settings.
     """
 
     def __init__(self, path: Path, settings: dict[str, Any]) -> None:
         self.path, self._tasks = path, dict[str, list[Row]]()
-        # as they come back from a file
+        # as JSON returns them
         settings = json.loads(json.dumps(settings))
         if not path.exists():
             path.write_text(json.dumps({"settings": settings}) + "\n")
@@ -117,11 +120,12 @@ class Ledger:
         found = _parsed(lines[0]) if lines else None
         if found is None or found.get("settings") != settings:
             raise ValueError(
-                f"{path} holds a study with other settings; take another --out, or delete it to start anew"
+                f"--out must be a new folder or hold this study; {path} has other settings: choose another --out, or "
+                "delete it to start again"
             )
         for line in lines[1:]:
             record = _parsed(line)
-            if record is not None:  # the last line of a killed study may be cut
+            if record is not None:  # an interrupted study may leave an incomplete last line
                 self._tasks[record["task"]] = [Row.from_json(row) for row in record["rows"]]
         complete = [json.dumps({"settings": settings}), *(self._line(task) for task in self._tasks)]
         path.write_text("\n".join(complete) + "\n")
@@ -130,7 +134,7 @@ class Ledger:
         return json.dumps({"task": task, "rows": [row.to_json() for row in self._tasks[task]]})
 
     def rows_of(self, task: str, work: Callable[[], Iterable[Row]]) -> list[Row]:
-        """Those of a task: from the file, or from doing the work, which is then kept."""
+        """Rows of a task: read from the file, or measured by `work` and then kept."""
         if task not in self._tasks:
             self._tasks[task] = list(work())
             with self.path.open("a") as file:
@@ -138,7 +142,7 @@ class Ledger:
         return self._tasks[task]
 
     def has(self, task: str) -> bool:
-        """Whether a task is finished."""
+        """Return whether a task is finished."""
         return task in self._tasks
 
 
@@ -150,7 +154,7 @@ def _parsed(line: str) -> dict[str, Any] | None:
 
 
 def write_csv(rows: Iterable[Row], path: Path) -> Path:
-    """The rows for a spreadsheet; `more` as JSON in a column of its own."""
+    """Write the rows as a spreadsheet; `more` is JSON in a column of its own."""
     names = [field.name for field in dataclasses.fields(Row)]
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, names)

@@ -1,4 +1,4 @@
-"""What a study looks at: a scene at any stiffness and resolution, a motion of it, and points to follow."""
+"""Study scenes: a scene at any stiffness and resolution, its motion, and material points to follow."""
 
 from __future__ import annotations
 
@@ -21,32 +21,32 @@ from ..scene.effects import Gravity, Ground, Pin, Solid
 from ..scene.scene import Scene
 from ..simulation.state import State
 
-__all__ = ["SCENES", "SUBJECTS", "Subject", "subject_of"]
+__all__ = ["SCENES", "STUDY_SCENES", "StudyScene", "study_scene"]
 
 Array = NDArray[np.float64]
 
 DENSITY = 1000.0  # kg/m^3
-_GAP = 0.002  # m between the ground and a body that is about to land
+_GAP = 0.002  # m between the ground and a body before it lands
 _LANDING = (0.3, -2.0, 0.0)  # m/s
-_HELD = 0.1  # of the height of a body
+_HELD = 0.1  # held part, over the height of a body
 _SWING = 2.0  # m/s at its top
 
 
 @dataclass(frozen=True)
-class Subject:
-    """A family of scenes: the same body at other stiffnesses and resolutions.
+class StudyScene:
+    """A family of scenes: the same body at several stiffnesses and resolutions.
 
-    `start(sim)` is the beginning of the motion; a single step is studied after `steps_before` steps of it.
-    `probes(scene, x)` [n, 3] m are the same material points at every resolution, from positions [V, 3].
+    `start(sim)` is the initial state of the motion; a single step is studied after `steps_before` steps of it.
+    `probes(mesh, x)` [n, 3] m are the same material points at every resolution, from positions [V, 3].
     """
 
     name: str
     mesh: Callable[[int], TetMesh]
-    scene: Callable[[TetMesh, float], Scene]  # of a Young's modulus [Pa]
+    scene: Callable[[TetMesh, float], Scene]  # built for a Young's modulus [Pa]
     start: Callable[[Simulator], State]
     probes: Callable[[TetMesh, Array], Array]
     resolution: int
-    resolutions: tuple[int, ...]  # of the study of the mesh, the finest is its reference; one: nothing to compare
+    resolutions: tuple[int, ...]  # of the mesh study; the finest is its reference, a single one means no mesh study
     youngs: float  # Pa
     time_step: float  # s
     steps_before: int = 0
@@ -71,7 +71,7 @@ def _beam_start(sim: Simulator) -> State:
 
 
 def _beam_probes(mesh: TetMesh, positions: Array) -> Array:
-    """The four edges at x = 0.2, 0.4, ... 1 m, which are vertices at every resolution."""
+    """Points of the four edges at x = 0.2, 0.4, ... 1 m, which are vertices at every resolution."""
     rest = mesh.vertices
     fifths, edges = 5.0 * rest[:, 0], 5.0 * rest[:, 1:]
     chosen = (np.abs(fifths - fifths.round()) < 1e-9) & (fifths > 0.5) & (np.abs(edges - edges.round()) < 1e-9).all(1)
@@ -105,12 +105,12 @@ def _held_start(sim: Simulator) -> State:
 
 
 def _above_held(heights: Any) -> Any:
-    """0 where the part that is held ends, 1 at the top, of an array or a tensor."""
+    """0 at the top of the held part, 1 at the top of the body; for an array or a tensor."""
     low = heights.min()
     return ((heights - low) / (heights.max() - low) - _HELD) / (1.0 - _HELD)
 
 
-# how a body moves; stiff enough to stand where it is held
+# motions of a body, and Young's moduli at which it stands when held
 SCENES: dict[str, dict[str, Any]] = {
     "lands": {"scene": _landing_scene, "start": _landing_start, "youngs": 3e4, "steps_before": 4},
     "held": {"scene": _held_scene, "start": _held_start, "youngs": 1e6},
@@ -126,10 +126,10 @@ def _surface_points(mesh: TetMesh, positions: Array) -> Array:
     return positions if mesh.embedding is None else mesh.embedding.apply(positions)
 
 
-def _body(name: str, shape: TetMesh | TriMesh, scene: str | None) -> Subject:
-    """A metre long, just above the ground."""
+def _body(name: str, shape: TetMesh | TriMesh, scene: str | None) -> StudyScene:
+    """A study scene of a body one metre long, just above the ground."""
     if scene not in (None, *SCENES):
-        raise ValueError(f"study: no scene {scene!r}; there are {', '.join(SCENES)}")
+        raise ValueError(f"study: --scene must be one of {', '.join(SCENES)}, got {scene!r}")
     low, high = shape.bounds
     placed = shape.translated(-(low + high) / 2.0).scaled(1.0 / float((high - low).max()))
     lattice = isinstance(placed, TriMesh)
@@ -139,16 +139,16 @@ def _body(name: str, shape: TetMesh | TriMesh, scene: str | None) -> Subject:
             return _above_ground(placed)
         return _above_ground(tetrahedralize(placed, cells=resolution, progress=False))
 
-    return Subject(
+    return StudyScene(
         name, mesh, probes=_surface_points, resolution=14, resolutions=(8, 11, 16, 22) if lattice else (14,),
         time_step=1 / 60, **SCENES[scene or "lands"],
     )  # fmt: skip
 
 
-def _beam(scene: str | None = None) -> Subject:
+def _beam(scene: str | None = None) -> StudyScene:
     if scene is not None:
-        raise ValueError("study: the scene is for bodies (octopus or a mesh), the beam is always held")
-    return Subject(
+        raise ValueError(f"study: --scene is for bodies (octopus or a mesh), not for the beam, got {scene!r}")
+    return StudyScene(
         "beam",
         _beam_mesh,
         _beam_scene,
@@ -161,18 +161,18 @@ def _beam(scene: str | None = None) -> Subject:
     )
 
 
-SUBJECTS: dict[str, Callable[..., Subject]] = {  # of a scene
+STUDY_SCENES: dict[str, Callable[..., StudyScene]] = {  # by name, called with --scene
     "beam": _beam,
     "octopus": lambda scene=None: _body("octopus", shapes.octopus(), scene),
 }
 
 
-def subject_of(name: str, scene: str | None = None) -> Subject:
-    """A subject by its name, or from the file of a mesh (surface or tetrahedral); bodies move as one of `SCENES`."""
-    if name in SUBJECTS:
-        return SUBJECTS[name](scene)
+def study_scene(name: str, scene: str | None = None) -> StudyScene:
+    """A study scene by name, or from a mesh file (surface or tetrahedral); bodies move as one of `SCENES`."""
+    if name in STUDY_SCENES:
+        return STUDY_SCENES[name](scene)
     path = Path(name)
     if not path.is_file():
-        raise FileNotFoundError(f"study: {name} is neither a file of a mesh nor one of {', '.join(SUBJECTS)}")
+        raise FileNotFoundError(f"study: SUBJECT must be a mesh file or one of {', '.join(STUDY_SCENES)}, got {name}")
     shape = TetMesh.from_file(path) if holds_body("study", path) else TriMesh.from_file(path)
     return _body(path.name, shape, scene)

@@ -1,7 +1,7 @@
-"""The study of what accuracy costs: `python -m torchpd study`. Which tasks there are, and what is written of them.
+"""The study `python -m torchpd study`: its tasks, and the files it writes.
 
-A study is a list of tasks, each of which gives rows; finished tasks are kept in `study.jsonl`, so that a killed study
-goes on where it was. From the rows come `study.json`, `study.csv`, pictures and one report in HTML.
+A study is a list of tasks, each of which measures rows. Finished tasks are kept in `study.jsonl`, so that an
+interrupted study resumes. The rows become `study.json`, `study.csv`, pictures and one HTML report.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from .axes import (
     time_step_rows,
 )
 from .bench import Bench, Setting, clock_of, precision_name
-from .results_log import Ledger, Row, write_csv
-from .scenes import Subject, subject_of
+from .results_log import ResultsLog, Row, write_csv
+from .scenes import StudyScene, study_scene
 from .trajectory import tolerance_rows, trajectory_rows
 
 __all__ = ["AXES", "SCHEMA", "StudyOptions", "cost_table", "paper_table", "run_study", "study_rows", "study_table"]
@@ -45,35 +45,35 @@ SCHEMA = 1
 AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper")
 _PACKAGES = ("matplotlib", "plotly", "threadpoolctl")
 _STIFFNESS_FACTORS = (0.01, 0.1, 1.0)
-_STIFF, _STIFF_MOST = "Multilevel", 32  # the solver for stiff bodies, and its iterations there at most
-_TOLERANCES = [1e-2, 1e-3, 1e-4], 128  # of its steps elsewhere, and iterations at most
-_LITERATURE_MOST = 256  # iterations of methods of the literature
+_STIFF, _STIFF_MOST = "Multilevel", 32  # the solver for stiff bodies, and its iteration limit there
+_TOLERANCES = [1e-2, 1e-3, 1e-4], 128  # tolerances of its steps elsewhere, and their iteration limit
+_LITERATURE_MOST = 256  # iteration limit of published methods
 
 Task = Callable[[], list[Row]]
 
 
 @dataclass(frozen=True)
 class StudyOptions:
-    """What `python -m torchpd study` takes."""
+    """Options of `python -m torchpd study`."""
 
-    subject: str = "beam"  # or "octopus", or the file of a mesh
-    scene: str | None = None  # of a body: "lands" on the ground, which is the default, or "held"
-    youngs: float | None = None  # Pa; that of the subject by default
+    subject: str = "beam"  # or "octopus", or a mesh file
+    scene: str | None = None  # of a body: "lands" on the ground (default) or "held"
+    youngs: float | None = None  # Pa; default: that of the study scene
     time_step: float | None = None  # s
     resolution: int | None = None  # cells across the beam, or lattice cells along the longest side
-    iterations: int = 1024  # of a step, at most
+    iterations: int = 1024  # upper limit per step
     axes: tuple[str, ...] = AXES
     device: str = "cpu"
-    threads: int | None = None  # of the CPU
+    threads: int | None = None  # CPU threads
     out: Path = Path("out/study")
-    quick: bool = False  # few points: shows that everything runs
+    quick: bool = False  # few points, only to check that everything runs
 
     def title(self) -> str:
-        """What figures are headed with."""
+        """Heading of the figures."""
         return ", ".join([Path(self.subject).name, *([self.scene] if self.scene else [])])
 
     def command(self) -> str:
-        """That does this study again."""
+        """Command that repeats this study."""
         words = ["python -m torchpd study", self.subject]
         plain = StudyOptions()
         for name in ("scene", "youngs", "time_step", "resolution", "iterations", "device", "threads", "out"):
@@ -86,16 +86,16 @@ class StudyOptions:
 
 
 def _counts(most: int) -> list[int]:
-    """1, 2, 3, 4, 6, 8, 12 ...: two in each doubling."""
+    """Iteration counts 1, 2, 3, 4, 6, 8, 12 ...: two in each doubling."""
     powers = [2**power for power in range(int(math.log2(most)) + 1)]
     return sorted({*powers, *(3 * power // 2 for power in powers[1:] if 3 * power // 2 <= most)})
 
 
-def _setting(subject: Subject, options: StudyOptions) -> Setting:
+def _setting(studied: StudyScene, options: StudyOptions) -> Setting:
     return Setting(
-        options.youngs or subject.youngs,
-        options.time_step or subject.time_step,
-        options.resolution or subject.resolution,
+        options.youngs or studied.youngs,
+        options.time_step or studied.time_step,
+        options.resolution or studied.resolution,
     )
 
 
@@ -115,7 +115,7 @@ def _solver_tasks(bench: Bench, setting: Setting, counts: list[int]) -> dict[str
                 tasks[key] = partial(dense_rows, bench, name, dtype, setting, fewer)
     else:
         for name, method in BASELINES.items():
-            # one twin is enough to show what the language costs
+            # one twin is enough to show the cost of the language
             if method.compiled_twin not in (None, DEFAULT):
                 continue
             tasks[f"solver: {name}"] = partial(baseline_rows, bench, name, setting, fewer)
@@ -123,8 +123,8 @@ def _solver_tasks(bench: Bench, setting: Setting, counts: list[int]) -> dict[str
 
 
 def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
-    """Everything that there is to measure, by name."""
-    setting = _setting(bench.subject, options)
+    """All measurements of the study, by name."""
+    setting = _setting(bench.study_scene, options)
     counts = _counts(min(options.iterations, 8) if options.quick else options.iterations)
     tasks: dict[str, Task] = _solver_tasks(bench, setting, counts)
     softened = [replace(setting, youngs=factor * setting.youngs) for factor in _STIFFNESS_FACTORS]
@@ -135,7 +135,7 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
         few = [count for count in counts if count <= _STIFF_MOST]
         key = f"stiffness: {_STIFF}, float32, {softer.youngs:g} Pa"
         tasks[key] = partial(stiffness_rows, bench, _STIFF, torch.float32, softer, few)
-    resolutions = bench.subject.resolutions[:3] if options.quick else bench.subject.resolutions
+    resolutions = bench.study_scene.resolutions[:3] if options.quick else bench.study_scene.resolutions
     tasks["float: default"] = partial(float_rows, bench, setting, counts)
     if options.quick:
         tasks["time step: default"] = partial(time_step_rows, bench, setting, 2, finer=1)
@@ -154,32 +154,32 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
 
 
 def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
-    """Measure what is not yet in the ledger of `options.out`, and return all rows."""
-    subject = subject_of(options.subject, options.scene)
+    """Measure the tasks missing from the results log of `options.out`, and return all rows."""
+    studied = study_scene(options.subject, options.scene)
     device = find_device(options.device)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
-    bench = Bench(subject, device, series=1, seconds=0.0) if options.quick else Bench(subject, device)
-    setting = _setting(subject, options)
+    bench = Bench(studied, device, series=1, seconds=0.0) if options.quick else Bench(studied, device)
+    setting = _setting(studied, options)
     options.out.mkdir(parents=True, exist_ok=True)
     settings = {
         "schema": SCHEMA, "subject": options.subject, "scene": options.scene, **asdict(setting),
         "iterations": options.iterations, "device": options.device, "threads": torch.get_num_threads(),
         "quick": options.quick,
     }  # fmt: skip
-    ledger = Ledger(options.out / "study.jsonl", settings)
+    log = ResultsLog(options.out / "study.jsonl", settings)
     rows: list[Row] = []
     tasks = _tasks(bench, options)
     with tqdm(total=len(tasks), desc="study", unit="task", disable=not progress, leave=False) as bar:
         for key, task in tasks.items():
             bar.set_postfix_str(key)
-            rows += ledger.rows_of(key, task)
+            rows += log.rows_of(key, task)
             bar.update(1)
     return rows
 
 
 def run_study(options: StudyOptions, *, progress: bool = True) -> str:
-    """Measure and write everything to `options.out`; the table to print."""
+    """Measure, write everything to `options.out`, and return the table to print."""
     _check(options)
     rows = study_rows(options, progress=progress)
     from .plots import draw_study
@@ -196,14 +196,14 @@ def run_study(options: StudyOptions, *, progress: bool = True) -> str:
     written = [options.out / "study.json"]
     written[0].write_text(_lines_of(record) + "\n")
     written.append(write_csv(rows, options.out / "study.csv"))
-    written += draw_study(rows, options.out, subject=record["subject"])
+    written += draw_study(rows, options.out, scene_name=record["subject"])
     written.append(write_report(rows, record, options.out / "report.html"))
     tables = [table for table in (study_table(rows), cost_table(rows), paper_table(rows)) if table]
     return "\n".join(["\n\n".join(tables), "", "written:", *(f"  {file}" for file in written)])
 
 
 def _lines_of(record: dict[str, Any]) -> str:
-    """JSON with a row in a line."""
+    """JSON text with one row per line."""
     rows = ",\n".join(json.dumps(row) for row in record["rows"])
     return json.dumps({**record, "rows": []}, indent=1).replace('"rows": []', f'"rows": [\n{rows}\n]')
 
@@ -212,20 +212,20 @@ def _check(options: StudyOptions) -> None:
     unknown = set(options.axes) - set(AXES)
     if unknown:
         raise ValueError(
-            f"study: no axis {', '.join(sorted(unknown))}; there are {', '.join(AXES)} "
-            "(--axes takes all words after it: SUBJECT comes before it)"
+            f"study: --axes must be among {', '.join(AXES)}, got {', '.join(sorted(unknown))}; put SUBJECT before "
+            "--axes, which takes all words after it"
         )
     missing = missing_packages(package for package in OPTIONAL if package.module in _PACKAGES)
-    if missing:  # said before the work, not after it
+    if missing:  # before the work, not after it
         names = ", ".join(package.pip_name for package in missing)
-        raise ModuleNotFoundError(f"the study needs {names}, not installed: pip install torchpd[study]")
+        raise ModuleNotFoundError(f"study needs {names}, not installed: pip install torchpd[study]")
 
 
 _GOALS = (1e-1, 1e-2, 1e-3)
 
 
 def study_table(rows: list[Row]) -> str:
-    """The solvers at a glance: iterations and milliseconds to three errors."""
+    """Table of the solvers: iterations and milliseconds to reach three errors."""
     solver = [row for row in rows if row.axis == "solver"]
     width = max([28, *(len(row.method) + 2 for row in solver)])
     lines = [f"{'solver':<{width}}{'precision':<11}" + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)]
@@ -233,23 +233,23 @@ def study_table(rows: list[Row]) -> str:
         own = [row for row in solver if (row.method, row.precision) == (name, precision)]
         lines.append(f"{name:<{width}}{precision:<11}{_costs(own)}")
     if any(row.parts for row in solver):
-        lines.append("methods of the literature, in float64, have the C++ local step too, but for ..., NumPy")
+        lines.append("published methods, in float64, also run the C++ local step, except those named ..., NumPy")
     if any(row.status == "uncertain" for row in rows):
-        lines.append("uncertain: no converged step is known well enough to say so, or one of less energy was met")
+        lines.append("uncertain: the converged step is not known well enough, or a state of lower energy was found")
     if any(row.refusal for row in solver):
         lines.append("with --scene held a body has no contacts, and every method runs")
     return "\n".join(lines) if solver else ""
 
 
 def _costs(rows: list[Row]) -> str:
-    """The cells of one solver."""
+    """Table cells of one solver."""
     if rows[0].refusal:
         return f"  refused: {rows[0].refusal}"
     return "".join(f"{_first_at(rows, goal):>22}" for goal in _GOALS)
 
 
 def _first_at(rows: list[Row], goal: float) -> str:
-    """The fewest iterations of the studied ones that reach an error, and their time."""
+    """The fewest measured iterations that reach an error, and their time."""
     reached = [row for row in rows if row.reaches(goal) and row.milliseconds is not None]
     if not reached:
         return "uncertain" if any(row.may_reach(goal) for row in rows) else "not reached"
@@ -258,9 +258,10 @@ def _first_at(rows: list[Row], goal: float) -> str:
 
 
 def cost_table(rows: list[Row]) -> str:
-    """What an error costs the default and `Multilevel` in float32, at every stiffness, and what 64 iterations give.
+    """Table of the cost of an error, for the default and `Multilevel` in float32 at every stiffness.
 
-    The last column is how far the body is from its converged path at most, over its way, when all steps are like that.
+    Includes the result of 64 iterations. The last column is the largest distance of the body from its converged path,
+    over its displacement, when all steps are solved like that.
     """
     own = [row for row in rows if row.axis == "stiffness" and row.precision == "float32"]
     lines = [
@@ -281,7 +282,7 @@ def cost_table(rows: list[Row]) -> str:
 
 
 def paper_table(rows: list[Row]) -> str:
-    """The tests of the source paper beside steps of as many tetrahedra, 64 iterations each."""
+    """Table of the source paper's tests beside steps of as many tetrahedra, 64 iterations each."""
     tests = [row for row in rows if row.axis == "paper" and row.milliseconds is not None]
     lines = [f"{'constraints':<13}{'tetrahedra':>12}{'paper, GTX 470':>18}{'here':>12}{'error':>12}"]
     lines += [

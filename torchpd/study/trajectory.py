@@ -1,4 +1,4 @@
-"""What unfinished solves do to a motion: false softness, damping and growth of energy, against the converged motion."""
+"""Effect of unconverged steps on a motion: false softness, damping and energy growth, against the converged motion."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = ["compare_trajectories", "first_turn", "record_trajectory", "tolerance
 def record_trajectory(
     bench: Bench, sim: Simulator, resolution: int, seconds: float, *, solve: bool = False
 ) -> Trajectory:
-    """The motion of the subject from its start, for so many seconds of its time.
+    """Record the motion of the study scene from its start, for `seconds` of simulated time.
 
-    With `solve` every step is solved to 1e-9, whatever the solver of the simulator.
+    With `solve` every step is solved to 1e-9 by the solvers of `solved_step`.
     """
     state, steps = bench.start(sim), max(1, round(seconds / sim.time_step))
     clock = clock_of(bench.device)
@@ -45,18 +45,18 @@ def record_trajectory(
     elapsed = clock() - begin
     energies = sim.energy(State(positions.to(sim.device), velocities)).double().cpu().numpy()
     mesh = bench.mesh(resolution)
-    probes = np.stack([bench.subject.probes(mesh, x) for x in positions.double().numpy()])
-    brought = float(sim.energy(state)[0] - sim.energy(state.positions)[0])
-    return Trajectory(sim.time_step, probes, energies, brought, 1e3 * elapsed / steps, solved, iterations)
+    probes = np.stack([bench.study_scene.probes(mesh, x) for x in positions.double().numpy()])
+    initial_kinetic = float(sim.energy(state)[0] - sim.energy(state.positions)[0])
+    return Trajectory(sim.time_step, probes, energies, initial_kinetic, 1e3 * elapsed / steps, solved, iterations)
 
 
 def first_turn(signal: Array, time_step: float) -> float:
-    """When a signal first turns back [s], half a period of a swing from rest: by a parabola through three samples.
+    """Time [s] of the first turning point of a signal (half a period of a swing from rest), by a parabola.
 
-    NaN when it does not turn, or does so within rounding.
+    NaN without a turning point, or for one within rounding.
     """
     change = np.diff(signal)
-    # two equal samples at the top also are a turn
+    # two equal samples at the top also form a turning point
     turned = np.flatnonzero((change[:-1] * change[1:] <= 0.0) & (change[:-1] != 0.0))
     if not len(turned):
         return math.nan
@@ -66,18 +66,18 @@ def first_turn(signal: Array, time_step: float) -> float:
 
 
 def compare_trajectories(motion: Trajectory, exact: Trajectory) -> dict[str, float]:
-    """How a motion differs from the converged one.
+    """Differences of a motion from the converged one.
 
-    path: largest distance of a probe from its converged place, over the largest way of any probe.
-    turn: time of the first turning point of the swing, relative to the converged one, less one.
-    softness: how far it swings out, relative to the converged motion, less one: positive is too soft.
-    energy: at the end, less that of the converged motion, over the kinetic energy of the start: negative is false
-        damping, positive is energy out of nothing.
-    growth: largest rise above the energy of the start, over the kinetic energy of the start; implicit Euler has none.
+    path: largest distance of a probe from its converged position, over the largest displacement of any probe.
+    turn: time of the first turning point of the swing, over the converged one, less one.
+    softness: amplitude of the swing over that of the converged motion, less one; positive is too soft.
+    energy: final energy less that of the converged motion, over the kinetic energy of the start. Negative is false
+        damping, positive is energy growth.
+    growth: largest rise above the initial energy, over the kinetic energy of the start; implicit Euler has none.
     """
     ways = exact.probes - exact.probes[0]
     far = int(np.linalg.norm(ways, axis=2).max(axis=0).argmax())
-    # along the direction in which the farthest probe swings most
+    # along the direction of the largest swing of the farthest probe
     direction = np.linalg.svd(ways[:, far] - ways[:, far].mean(axis=0))[2][0]
     swings = [(t.probes[:, far] - t.probes[0, far]) @ direction for t in (motion, exact)]
     turns = [first_turn(swing, t.time_step) for swing, t in zip(swings, (motion, exact), strict=True)]
@@ -86,13 +86,13 @@ def compare_trajectories(motion: Trajectory, exact: Trajectory) -> dict[str, flo
         "path": float(np.linalg.norm(motion.probes - exact.probes, axis=2).max() / np.linalg.norm(ways, axis=2).max()),
         "turn": turns[0] / turns[1] - 1.0,
         "softness": reach[0] / reach[1] - 1.0,
-        "energy": float(motion.energies[-1] - exact.energies[-1]) / exact.brought,
-        "growth": float((motion.energies - motion.energies[0]).max()) / exact.brought,
+        "energy": float(motion.energies[-1] - exact.energies[-1]) / exact.initial_kinetic,
+        "growth": float((motion.energies - motion.energies[0]).max()) / exact.initial_kinetic,
     }
 
 
 def _converged(bench: Bench, setting: Setting, seconds: float) -> Trajectory:
-    """Recorded once for all solvers."""
+    """The converged motion, recorded once for all solvers."""
     key = (setting, seconds)
     if key not in bench.motions:
         sim = bench.simulator(setting, torch.float64)
@@ -103,7 +103,7 @@ def _converged(bench: Bench, setting: Setting, seconds: float) -> Trajectory:
 def trajectory_rows(
     bench: Bench, setting: Setting, counts: list[int], *, seconds: float = 1.0, name: str = DEFAULT
 ) -> list[Row]:
-    """A motion at several iteration counts of a solver in float32, against the converged one in float64."""
+    """A motion at several iteration counts of a float32 solver, against the converged one in float64."""
     solver = bench.solver(name, setting)[0]
     rows = []
     for count in counts:
@@ -116,7 +116,7 @@ def trajectory_rows(
 def tolerance_rows(
     bench: Bench, setting: Setting, tolerances: list[float], most: int, *, seconds: float = 1.0, name: str
 ) -> list[Row]:
-    """A motion whose steps take the iterations that a tolerance asks for, as many as `most`; theirs is the mean."""
+    """A motion solved to several tolerances with at most `most` iterations; `iterations` is the mean."""
     solver = bench.solver(name, setting)[0]
     rows = []
     for tolerance in tolerances:

@@ -1,4 +1,4 @@
-"""Moving surfaces as files that common viewers play, and pictures as films.
+"""Write moving surfaces for common viewers, and pictures as films.
 
 Lengths in m, y up, times in s, colours linear RGB in 0..1, images uint8 [H, W, 3].
 """
@@ -23,10 +23,10 @@ Picture = NDArray[np.uint8]
 Color = tuple[float, float, float]
 
 _ROUGHNESS = 0.4
-# One palette for all frames, as separate ones flicker; its steps are hidden by a pattern that stays where it is, as
-# diffused errors shimmer.
+# One palette for all frames, since separate ones flicker. An ordered dither pattern hides its steps; error diffusion
+# would shimmer.
 _PALETTE = "split[a][b];[a]palettegen[p];[b][p]paletteuse=dither=bayer:bayer_scale=4"
-# of an ending: what the sides of a picture are multiples of, most frames in a second, and what ffmpeg is told
+# by suffix: factor of the picture's sides, largest frame rate [1/s], and options for ffmpeg
 _FILMS: dict[str, tuple[int, float, dict[str, Any]]] = {
     ".gif": (1, 50.0, {"codec": "gif", "pix_fmt_out": "pal8", "output_params": ["-filter_complex", _PALETTE]}),
     ".mp4": (2, math.inf, {"codec": "libx264", "pix_fmt_out": "yuv420p", "quality": 8}),  # every browser plays it
@@ -42,26 +42,26 @@ def write_surface(
     color: Color = (0.72, 0.10, 0.04),
     keyframes: int = 61,
 ) -> Path:
-    """Write a moving surface; the ending of `path` decides the format.
+    """Write a moving surface; the suffix of `path` decides the format.
 
     `.usdc`, `.usda`, `.usd`: points with one time sample per frame (Blender, Houdini, usdview, Omniverse); needs
     usd-core. `.glb`: glTF morph targets, one per key frame and linear in between (browsers, Blender); needs pygltflib.
-    Every key frame takes 24 bytes per vertex, so a long motion is thinned out to `keyframes` of its frames.
+    Every key frame takes 24 bytes per vertex, so a long motion is thinned to `keyframes` of its frames.
 
     Args:
-        path: of the file; an existing one is replaced, a folder that is missing is made.
-        frames: [T, n, 3] positions.
+        path: the file; an existing one is replaced, a missing folder is created.
+        frames: [T, n, 3] positions [m].
         triangles: [m, 3] vertex numbers.
-        frames_per_second: of `frames`, in simulated time.
+        frames_per_second: frame rate of `frames` in simulated time [1/s].
         color: of the surface.
-        keyframes: most key frames that a .glb may hold, at least 2.
+        keyframes: most key frames in a .glb, at least 2.
     """
     target = _output(path, (".usdc", ".usda", ".usd", ".glb"))
     motion = as_array("frames", frames, np.float64, for_picture=True)
     if motion.ndim == 4:
         raise ValueError(
-            f"frames must be [n, n, 3] (positions [m] in every frame), got {list(motion.shape)}, those of several "
-            "environments; choose one: frames[:, 0]"
+            f"frames must be [n, n, 3], positions [m] of one environment in every frame, got {list(motion.shape)}; "
+            "choose one environment: frames[:, 0]"
         )
     check_shape("frames", motion, (None, None, 3), "positions [m] in every frame")
     check_finite("frames", motion)
@@ -82,12 +82,12 @@ def write_surface(
 
 
 def write_film(path: str | Path, images: Sequence[Picture], *, frames_per_second: float) -> Path:
-    """Write pictures as a film (needs imageio-ffmpeg): `.gif`, which plays for ever, or `.mp4` (H.264).
+    """Write pictures as a film: `.gif`, which repeats, or `.mp4` (H.264). Needs imageio-ffmpeg.
 
     Args:
-        path: of the file; an existing one is replaced, a folder that is missing is made.
-        images: of one size; an .mp4 leaves out an odd last row or column.
-        frames_per_second: of the film; a .gif plays at most 50, as browsers slow down what is faster.
+        path: the file; an existing one is replaced, a missing folder is created.
+        images: pictures of one size; an .mp4 drops an odd last row or column.
+        frames_per_second: frame rate of the film; a .gif plays at most 50, since browsers slow down faster ones.
     """
     target = _output(path, tuple(_FILMS))
     rate = check_scalar("frames_per_second", frames_per_second)
@@ -163,7 +163,7 @@ def _write_glb(path: Path, surface: SmoothSurface, motion: Array, times: Array, 
     accessors: list[Any] = []
 
     def add(array: NDArray[Any], target: int | None = None) -> int:
-        """Append numbers, [n] or [n, 3]; the number of their accessor."""
+        """Append an array [n] or [n, 3] to the buffer; returns the index of its accessor."""
         kind, code = (np.uint32, gltf.UNSIGNED_INT) if array.dtype.kind in "iu" else (np.float32, gltf.FLOAT)
         values = np.ascontiguousarray(array, dtype=kind)
         bounds = {name: np.atleast_1d(end).tolist() for name, end in (("min", values.min(0)), ("max", values.max(0)))}
@@ -195,7 +195,7 @@ def _write_glb(path: Path, surface: SmoothSurface, motion: Array, times: Array, 
         materials=[gltf.Material(pbrMetallicRoughness=plastic, doubleSided=True, alphaCutoff=None)],
     )
     if len(shapes) > 1:
-        # at key frame k target k - 1 alone counts; linear weights in between are linear positions
+        # at key frame k only target k - 1 has weight; linear weights in between give linear positions
         sampler = gltf.AnimationSampler(input=add(times), output=add(np.eye(len(shapes))[:, 1:].reshape(-1)))
         target = gltf.AnimationChannelTarget(node=0, path="weights")
         channel = gltf.AnimationChannel(sampler=0, target=target)

@@ -1,4 +1,4 @@
-"""Pictures of moving surfaces without a display: a small photo studio for Mitsuba's scalar path tracer.
+"""Pictures of moving surfaces without a display: a small studio for Mitsuba's scalar path tracer.
 
 Lengths in m, y up, angles in degrees, colours linear RGB in 0..1, images uint8 [H, W, 3] in sRGB.
 """
@@ -29,32 +29,32 @@ Color = tuple[float, float, float]
 CORAL: Color = (0.72, 0.10, 0.04)
 _FLOOR: Color = (0.41, 0.53, 0.60)
 _KEY_LIGHT: Color = (12.0, 11.4, 10.6)  # radiance of the soft box, warm
-_SKY: Color = (0.61, 0.625, 0.66)  # radiance from everywhere, cool
-_ROWS = 16  # of a picture at a time, so that they stay in the cache
+_SKY: Color = (0.61, 0.625, 0.66)  # radiance of the surrounding sky, cool
+_ROWS = 16  # image rows rendered at a time, so that they stay in the cache
 _MARGIN = 16  # pixels
 _PAPER, _INK = (255, 255, 255), (62, 64, 70)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that stands upright."""
+    """An upright pinhole camera."""
 
     origin: Color  # m
-    target: Color  # m, in the middle of the picture
-    fov: float  # vertical opening, degrees
+    target: Color  # m, at the centre of the picture
+    fov: float  # vertical field of view, degrees
 
     def __post_init__(self) -> None:
         forward = check_vector("Camera.target", self.target) - check_vector("Camera.origin", self.origin)
         if not float(np.hypot(forward[0], forward[2])) > 1e-9 * float(np.linalg.norm(forward)):
             raise ValueError(
-                f"Camera: origin and target must not lie above each other, nor at the same place, got {self.origin} "
-                f"and {self.target}; a camera stands upright, so move one of them a little"
+                f"Camera: origin and target must differ horizontally, as the camera is upright, got {self.origin} and "
+                f"{self.target}; move one of them sideways a little"
             )
         if not 0.0 < check_scalar("Camera.fov", self.fov) < 180.0:
             raise ValueError(f"Camera.fov must lie between 0 and 180 degrees, got {self.fov}")
 
     def rays(self, size: tuple[int, int]) -> Array:
-        """Unit directions [H, W, 3] through the middles of the pixels."""
+        """Unit directions [H, W, 3] through the pixel centres."""
         width, height = size
         forward = np.array(self.target) - np.array(self.origin)
         forward /= np.linalg.norm(forward)
@@ -75,7 +75,7 @@ class Camera:
 
 
 def _view_axes(azimuth: float, elevation: float) -> Array:
-    """Rows right, up, forward of a camera that looks at the origin from there."""
+    """Rows right, up, forward of a camera that looks at the origin from this direction."""
     turn, lift = np.radians(azimuth), np.radians(elevation)
     forward = -np.array([np.sin(turn) * np.cos(lift), np.sin(lift), np.cos(turn) * np.cos(lift)])
     right = np.array([np.cos(turn), 0.0, -np.sin(turn)])
@@ -91,13 +91,13 @@ def frame_camera(
     aspect: float = 4.0 / 3.0,
     margin: float = 0.07,
 ) -> Camera:
-    """The nearest camera, looking from the given direction, that has every point in its picture.
+    """The nearest camera in the given direction that has every point in its picture.
 
     Args:
-        points: [..., 3] all that shall be seen, for example the vertices of all frames of a motion.
-        azimuth: of the camera around the vertical, 0 on the +z side, 90 on the +x side.
-        elevation: of the camera above the horizontal, in -90..90 exclusive.
-        fov: vertical opening.
+        points: [..., 3] m, all points to show, for example the vertices of all frames of a motion.
+        azimuth: of the camera around the vertical [degrees], 0 on the +z side, 90 on the +x side.
+        elevation: of the camera above the horizontal [degrees], in -90..90 exclusive.
+        fov: vertical field of view [degrees].
         aspect: width / height of the picture.
         margin: fraction of the picture left free at each border.
     """
@@ -111,7 +111,7 @@ def frame_camera(
     x, y, depth = axes @ seen.T
     slope = (1.0 - 2.0 * margin) * np.tan(np.radians(fov) / 2.0)
 
-    # a point is in the picture when |x - x_eye| <= slope (depth - depth_eye): a tightest pair of planes per axis
+    # a point is in the picture when |x - x_eye| <= slope (depth - depth_eye): the tightest pair of planes per axis
     eye = np.zeros(3)
     depths = []
     for axis, (offset, opening) in enumerate(((x, slope * aspect), (y, slope))):
@@ -126,19 +126,19 @@ def frame_camera(
 
 
 class Studio:
-    """Camera, lights and floor around one surface, laid out for all of its motion.
+    """Camera, lights and floor around one surface, placed for all of its motion.
 
     >>> studio = Studio(frames, triangles)           # frames [T, n, 3]
     >>> image = studio.render(frames[10])            # uint8 [360, 480, 3]
 
     Args:
-        frames: [T, n, 3] or [n, 3], positions of the surface's vertices; the first frame decides where it has creases.
+        frames: [T, n, 3] or [n, 3] m, positions of the surface's vertices; the first frame decides the creases.
         triangles: [m, 3] vertex numbers.
-        ground: height of the floor; None puts it below the lowest vertex of all frames.
+        ground: height of the floor [m]; None puts it below the lowest vertex of all frames.
         camera: None frames the whole motion.
-        color: of the surface.
-        size: width and height of the pictures.
-        samples: light paths per pixel, rounded up to a square; the grain that they leave is filtered out.
+        color: reflectance of the surface.
+        size: width and height of the pictures [pixels].
+        samples: light paths per pixel, rounded up to a square; a denoiser removes the remaining noise.
     """
 
     def __init__(
@@ -168,7 +168,7 @@ class Studio:
         self.camera = camera or frame_camera(motion, aspect=size[0] / size[1])
 
     def render(self, vertices: Any) -> Picture:
-        """The picture of one frame [n, 3]; the same bits for the same input."""
+        """Render one frame [n, 3] m; equal inputs give equal bits."""
         frame = as_array("vertices", vertices, np.float64, for_picture=True)
         check_shape("vertices", frame, (self._count, 3), "positions of the vertices that the studio was made for [m]")
         check_finite("vertices", frame)
@@ -183,7 +183,7 @@ class Studio:
         return max(float(np.linalg.norm(self.high - self.low)) / 2.0, 1e-6)
 
     def _scene(self, mi: Any, positions: Array, normals: Array) -> dict[str, Any]:
-        """All that stands in the studio; distances follow the size of the motion, directions the camera."""
+        """The Mitsuba scene; distances scale with the motion, directions follow the camera."""
         radius, middle = self._radius(), (self.low + self.high) / 2.0
         middle[1] = self.ground
         sight = np.array(self.camera.target) - np.array(self.camera.origin)
@@ -199,7 +199,7 @@ class Studio:
             "clearcoat": 0.5,
             "clearcoat_gloss": 0.85,
         }
-        # the same from both sides, because an open surface shows both
+        # two-sided, because an open surface shows both sides
         body = _mesh(mi, positions, self.surface.triangles, normals, bsdf={"type": "twosided", "material": material})
         return {
             "type": "scene",
@@ -216,7 +216,7 @@ class Studio:
         }
 
     def _floor(self, mi: Any) -> dict[str, Any]:
-        """Wide enough to fill every picture that looks down on it."""
+        """A floor that fills every picture from above."""
         radius, middle = self._radius(), (self.low + self.high) / 2.0
         level = mi.ScalarTransform4f().translate([middle[0], self.ground, middle[2]]).rotate([1, 0, 0], -90.0)
         return {"type": "rectangle", "to_world": level.scale(400.0 * radius)}
@@ -235,14 +235,14 @@ class Studio:
                 "width": self.size[0],
                 "height": self.size[1],
                 "pixel_format": "rgb",
-                "rfilter": {"type": "box"},  # pixels without common samples: the filter relies on independent grain
+                "rfilter": {"type": "box"},  # pixels share no samples: the denoiser needs independent noise
             },
             "sampler": {"type": "stratified"},
         }
 
 
 def render(vertices: Any, triangles: Any, **options: Any) -> Picture:
-    """One picture of a surface at rest; `options` are those of `Studio`. Frames of a motion: use one `Studio`."""
+    """Render one picture of a surface at rest; `options` are those of `Studio`. For a motion use one `Studio`."""
     return Studio(vertices, triangles, **options).render(vertices)
 
 
@@ -254,13 +254,13 @@ def contact_sheet(
     path: str | Path | None = None,
     gap: int = 8,
 ) -> Picture:
-    """All images of one size side by side on white, row by row, with captions in their lower left corners.
+    """Place images of one size side by side on white, row by row, with captions in their lower left corners.
 
     Args:
         images: uint8 [H, W, 3] each.
         columns: images per row.
         captions: one per image.
-        path: writes the sheet there too; the ending decides the format.
+        path: also write the sheet to this file; the suffix decides the format.
         gap: pixels between the images and around them.
     """
     if not images or any(image.shape != images[0].shape for image in images):
@@ -287,20 +287,20 @@ def contact_sheet(
 
 
 def _denoise(radiance: Radiance) -> Radiance:
-    """Without the grain of few light paths, by Intel's Open Image Denoise where there is a build of it."""
+    """Remove the noise of few light paths by Intel's Open Image Denoise, if installed."""
     try:
         from pyoidn import denoise
     except ImportError:
-        warn_user("pictures keep their grain, as pyoidn is missing: pip install pyoidn, or take more samples")
+        warn_user("pictures stay noisy without pyoidn: pip install pyoidn, or raise samples")
         return radiance
     wide = np.pad(
         radiance, (*2 * ((_MARGIN, _MARGIN),), (0, 0)), mode="symmetric"
-    )  # else it leaves a seam at the edges
+    )  # without a margin the denoiser leaves a seam at the edges
     return np.asarray(denoise(wide, hdr=True)[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN])
 
 
 def _develop(radiance: Radiance) -> Picture:
-    """Linear radiance to sRGB; what is brighter than 0.7 bends towards white instead of being cut off."""
+    """Convert linear radiance to sRGB; values above 0.7 are compressed towards white instead of clipped."""
     linear = np.maximum(radiance, 0.0)
     linear = np.where(linear > 0.7, 1.0 - 0.3 * np.exp(-(linear - 0.7) / 0.3), linear)
     encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.power(linear, 1.0 / 2.4) - 0.055)
@@ -330,7 +330,7 @@ def _triple(vector: Array) -> tuple[float, float, float]:
 
 @contextmanager
 def _mitsuba() -> Iterator[Any]:
-    """Mitsuba in its scalar variant (needs neither LLVM nor a GPU); the caller's variant comes back afterwards."""
+    """Mitsuba in its scalar variant (no LLVM or GPU needed); restores the caller's variant afterwards."""
     mitsuba = optional_module("mitsuba", "Mitsuba", "pictures")
     before = mitsuba.variant()
     mitsuba.set_variant("scalar_rgb")

@@ -1,4 +1,4 @@
-"""Smooth normals of a moving surface: shared where it bends gently, split where it has an edge."""
+"""Smooth normals of a moving surface: shared on gentle bends, split at edges."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _GRAZING = 0.03  # least cosine between a normal and the direction to the eye
 class SmoothSurface:
     """Triangles whose vertices are split at creases, so that one normal per vertex shades them well.
 
-    Two triangles share the normals along an edge when the angle between them is below `crease` in the shape given
-    here. The split is kept while the surface moves: a fold that opens or closes does not flicker. Vertices at the
-    same place count as one (files double them at texture seams), wherever in the list they stand.
+    Two triangles share the normals along an edge if they meet at less than `crease` in the shape given here. The split
+    stays while the surface moves, so that a fold that opens or closes does not flicker. Vertices at equal positions
+    count as one, at any place in the list: files duplicate them at texture seams.
 
     Attributes:
-        source: [S] which of the given vertices each split vertex follows.
+        source: [S] the given vertex that each split vertex follows.
         triangles: [T, 3] into the split vertices.
     """
 
@@ -48,11 +48,11 @@ class SmoothSurface:
         self.source[corner_group] = faces.reshape(-1)
 
     def split(self, vertices: Array) -> Array:
-        """Positions [..., n, 3] of the given vertices as positions [..., S, 3] of the split ones."""
+        """Positions [..., S, 3] of the split vertices, from positions [..., n, 3] of the given ones."""
         return vertices[..., self.source, :]
 
     def normals(self, split_vertices: Array) -> Array:
-        """Unit normals [S, 3], weighted by area; +y where the triangles around a vertex cancel out."""
+        """Unit normals [S, 3], weighted by area; +y where the triangles around a vertex cancel."""
         import trimesh
 
         face_normals = trimesh.triangles.cross(split_vertices[self.triangles])
@@ -60,10 +60,10 @@ class SmoothSurface:
         return np.where(normals.any(axis=1, keepdims=True), normals, [0.0, 1.0, 0.0])
 
     def normals_seen_from(self, eye: Array, split_vertices: Array) -> Array:
-        """The normals [S, 3], where need be bent until they face the eye on every side of a triangle that does.
+        """The normals [S, 3], bent towards the eye where a visible triangle needs it.
 
-        Along the silhouette of a coarse surface an averaged normal may look away although its triangle is seen, and
-        a path tracer paints such a place black.
+        Along the silhouette of a coarse surface an averaged normal may point away although its triangle is visible. A
+        path tracer would render it black.
         """
         import trimesh
 
@@ -74,14 +74,14 @@ class SmoothSurface:
         seen_faces = np.einsum("ij,ij->i", face_normals, eye - split_vertices[self.triangles[:, 0]]) > 0.0
         seen = np.zeros(len(normals), dtype=bool)
         seen[self.triangles[seen_faces]] = True
-        side = np.where(seen, 1.0, -1.0)  # a vertex of hidden triangles alone is seen from behind, if at all
+        side = np.where(seen, 1.0, -1.0)  # a vertex of hidden triangles only is visible from behind, if at all
         lacking = np.maximum(0.0, _GRAZING - side * np.einsum("ij,ij->i", normals, towards))
         bent = normals + (side * lacking)[:, None] * towards
         return np.asarray(bent / np.linalg.norm(bent, axis=1, keepdims=True))
 
 
 def _smoothing_groups(vertices: Array, triangles: Index, crease: float) -> Index:
-    """The number [3T] of the split vertex that each corner of a triangle belongs to."""
+    """The split vertex [3T] of each corner of a triangle."""
     import trimesh
 
     place = np.unique(vertices, axis=0, return_inverse=True)[1].reshape(-1)[triangles]
@@ -92,7 +92,7 @@ def _smoothing_groups(vertices: Array, triangles: Index, crease: float) -> Index
     pairs, edges = trimesh.graph.face_adjacency(place, return_edges=True)
     gentle = np.einsum("ij,ij->i", *normals[pairs.T]) > np.cos(np.radians(crease))
     pairs, edges = pairs[gentle], edges[gentle]
-    # for each pair and each end of its edge: the corners of both triangles there
+    # both corners at each end of an edge shared by two triangles
     corner = (place[pairs][:, :, None] == edges[:, None, :, None]).argmax(axis=3) + 3 * pairs[:, :, None]
     rows, columns = corner[:, 0].reshape(-1), corner[:, 1].reshape(-1)
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(triangles.size, triangles.size))
