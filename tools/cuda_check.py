@@ -4,8 +4,10 @@ The C++ sources of a CUDA build are read too, as far as the compiler's syntax ch
 
 What ptxas says about registers, spills and shared memory is kept in build/cuda-check/, one report per source, and with
 --table FILE as one table (CSV) of all kernels; benchmarks/results/cuda-registers.csv is the one of this repository.
+--compare FILE compiles nothing: it fails if the table was made of other sources or flags. Comments, formatting, names
+of files and paths of includes do not count.
 --quick takes one architecture a source, in turn, goes as far as PTX and, where nvcc can, optimises nothing, which is a
-thirtieth of the work: where that table is not stale, as a test demands, ptxas has compiled all of it when it was made.
+thirtieth of the work. ptxas has compiled everything when the table was made, so CI compares it and checks quickly.
 """
 
 from __future__ import annotations
@@ -149,7 +151,8 @@ def kernel_name(signature: str) -> str:
 
 
 _INCLUDE = re.compile(r'^\s*#include "(.+)"', re.MULTILINE)
-_COMMENT = re.compile(r"//.*")
+# a comment or an include, which do not count, or a token
+_TOKEN = re.compile(r"""//.*|/\*[\s\S]*?\*/|^\s*#\s*include\b.*|\\\n|("(?:\\.|[^"\\\n])*"|\w+|[^\w\s])""", re.MULTILINE)
 
 
 def with_headers(sources: Iterable[Path], root: Path) -> list[Path]:
@@ -164,13 +167,13 @@ def with_headers(sources: Iterable[Path], root: Path) -> list[Path]:
 
 
 def fingerprint(root: Path = CSRC) -> str:
-    """Of all that a table depends on but the compiler: CUDA sources without comments, what they include, and flags."""
+    """Hash of all that a table depends on but the compiler: flags, targets, and tokens of CUDA sources and headers."""
     sources = sorted(root.glob("**/*.cu"))
-    digest = hashlib.sha256(repr([nvcc_flags(), list(map(targets_of, sources))]).encode())
+    parts = [repr(nvcc_flags())]
     for path in with_headers(sources, root):
-        code = _COMMENT.sub("", path.read_text(encoding="utf-8"))
-        digest.update(repr((path.relative_to(root).as_posix(), code.split())).encode())
-    return digest.hexdigest()[:16]
+        tokens = [token for token in _TOKEN.findall(path.read_text(encoding="utf-8")) if token]
+        parts.append(repr((tokens, targets_of(path) if path in sources else ())))
+    return hashlib.sha256("\n".join(sorted(parts)).encode()).hexdigest()[:16]
 
 
 def read_table(path: Path) -> tuple[str, list[dict[str, str]]]:
@@ -203,11 +206,28 @@ def write_table(path: Path, reports: list[Path], made_of: str) -> None:
         writer.writerows(rows)
 
 
+def compare_table(path: Path) -> int:
+    """Say whether a table was made of these sources: 0 if so, else 1."""
+    made_of, now = read_table(path)[0], fingerprint()
+    if made_of == now:
+        print(f"cuda-check: {path} is of these sources ({now})")
+        return 0
+    print(
+        f"cuda-check: {path} is of {made_of}, CUDA sources or flags are {now}; "
+        f"run `python tools/cuda_check.py --table {path}`",
+        file=sys.stderr,
+    )
+    return 1
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description="Compile every CUDA source; no GPU needed.")
     parser.add_argument("--table", type=Path, help="file for a table of the kernels' registers and spills (CSV)")
+    parser.add_argument("--compare", type=Path, metavar="TABLE", help="fail if a table is of other sources")
     parser.add_argument("--quick", action="store_true", help="PTX of one architecture a source, in turn")
     options = parser.parse_args()
+    if options.compare is not None:
+        return compare_table(options.compare)
     if options.quick and options.table is not None:
         parser.error("--table is of all architectures, so it does not go with --quick")
     nvcc = find_tool("nvcc")
