@@ -7,6 +7,7 @@ import importlib
 import importlib.metadata
 import inspect
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ import torchpd
 
 PACKAGE_FILES = sorted((ROOT / "torchpd").rglob("*.py"))
 PLACEHOLDERS = re.compile(r"\b(" + "|".join(["TO" + "DO", "FIX" + "ME", "raise NotImplemented" + "Error"]) + r")\b")
+MOST_WORDS = 35  # of a sentence; 25 is the aim
 TEXT_SUFFIXES = {".py", ".pyi", ".h", ".cuh", ".cpp", ".cu", ".inl", ".def", ".md", ".toml"}
 TEXT_FOLDERS = ("torchpd", "csrc", "tests", "examples", "benchmarks", "tools")
 
@@ -57,6 +59,30 @@ def test_module_is_documented_and_lists_its_names(path: Path) -> None:
     parts = path.relative_to(ROOT).with_suffix("").parts
     module = importlib.import_module(".".join(parts[: len(parts) - (path.stem == "__init__")]))
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
+
+
+def prose_of(source: str) -> Iterator[tuple[int, str]]:
+    """Docstrings and comments with their lines; comments on lines below one another are one."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+            yield getattr(node, "lineno", 1), text
+    for block in re.finditer(r"(?:^ *# .*\n)+|(?<=  )# .*$", source, re.MULTILINE):
+        yield source.count("\n", 0, block.start()) + 1, re.sub(r"^ *# ", "", block.group(), flags=re.MULTILINE)
+
+
+def sentences(text: str) -> Iterator[str]:
+    """Sentences without numbers and signs. Code in backquotes is a word; an argument or a row of a table ends one."""
+    text = re.sub(r"`[^`]*`", "code", text)
+    text = re.sub(r"\n(?= {4}\S| {9,}\S|[A-Z]\w+:$)", "\n\n", text, flags=re.MULTILINE)
+    for sentence in re.split(r"\n\n|(?<=[.!?])(?<!et al\.)\s", text):
+        yield " ".join(word for word in sentence.split() if re.search("[A-Za-z]", word))
+
+
+@pytest.mark.parametrize("path", PACKAGE_FILES, ids=lambda path: path.relative_to(ROOT / "torchpd").as_posix())
+def test_docstrings_and_comments_have_short_sentences(path: Path) -> None:
+    found = prose_of(path.read_text(encoding="utf-8"))
+    long = [(line, one) for line, text in found for one in sentences(text) if len(one.split()) > MOST_WORDS]
+    assert long == []
 
 
 def test_every_package_is_installed() -> None:

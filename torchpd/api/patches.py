@@ -44,9 +44,8 @@ class FreeFormPatches(PatchSurface):
         thickness: tau, half the thickness of the solid that `field` describes [m].
 
     Raises:
-        ValueError: triangles without area, edges with more than two triangles or two of the same direction, vertices
-            without a triangle, quadrics that are not finite, or patches on which heights on the surface may not be
-            unique.
+        ValueError: triangles without area; edges with more than two triangles, or two of the same direction; vertices
+            without a triangle. Also quadrics that are not finite, and patches on which heights may not be unique.
     """
 
     @classmethod
