@@ -4,8 +4,8 @@ Scenes: a cube that lands, one that slides, a slab that slides, and a cube that 
 1e5 to 1e7 Pa, the time step is 1/60 s, some steps into the motion. Contacts are frictionless or have a coefficient of
 0.5, where some vertices stick and others slide. Iterations are the fewest of a grid of four per octave, in float64.
 
-Errors are |x - x*| / |x + h v - x*|. x* is the step after as many iterations of `Multilevel` as bring its residual to
-1e-9, at most 10,800 (then marked by ?). Milliseconds are medians of that many iterations in float32.
+Errors are |x - x*| / |x + h v - x*|. `Multilevel` solves x* to a residual of 1e-9 in at most 10,800 iterations; rows
+above that residual are marked by ?. Milliseconds are medians of the found numbers of iterations in float32.
 """
 
 from __future__ import annotations

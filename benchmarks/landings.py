@@ -8,9 +8,9 @@ Bodies hit the ground with a face, tilted, or in any position. Six steps from th
 converged step is known to 1e-4 and differs from the first iterate by more than float32 resolves. Soft bodies, for which
 Chebyshev takes less than 60 iterations, are left out.
 
-Iterations are counted on a grid of four per octave: the first that reach 1e-3 and still do so at the next number of the
-grid and at the last. If none do, residual and energy tell whether they converge or end in another minimum. Measured
-scenes are kept.
+Iterations are counted on a grid of four per octave. The first number counts that reaches 1e-3 and still does so at the
+next number of the grid and at the last. If none does, residual and energy tell whether they converge or end in another
+minimum. Measured scenes are kept.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Throughput of free-form patches: heights, surface points and rays per second beside lower bounds; and fits.
 
 A ball has 20 x 4^n patches and as many quadrics as vertices, float32. A lower bound on the CPU is the larger of two
-times. The first is that of the fewest additions and multiplications in the formulas, at the scalar rate of all threads
-(the rate of the extension's SIMD multiply-adds over the lanes). The second is that of the bytes read and written, at
-the rate of a large copy. A ray counts the boxes on one path of the tree and, if it hits, two surface points: one to
-correct, one to verify.
+times. The first is that of the fewest additions and multiplications in the formulas, at the scalar rate of all
+threads: the rate of the extension's SIMD multiply-adds over the lanes. The second is that of the bytes read and
+written, at the rate of a large copy. A ray counts the boxes on one path of the tree and, if it hits, two surface
+points: one to correct, one to verify.
 
 "search" is the op, "hits" adds points and normals, "picture" shades. "field" intersects the published field, with a
 tree and with every patch tried for every ray. "fit" is `FreeFormPatches.fit` of a bumpy blob, on the CPU for any

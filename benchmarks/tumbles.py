@@ -1,9 +1,10 @@
 """Check that the rigid motions after the iterations do not move a solved step.
 
-Boxes of 5 to 40 cm and 3e4 to 1e7 Pa, on a face, an edge or in any position, fall, slide and tumble on ground with
-friction of 0 to 2 (float64). Eight steps of each are solved by 3000 iterations: `Multilevel()` up to friction 0.3, else
-`Chebyshev(rho=0.99)`. If one keeps more than 1e-5 of its residual, the reference iterates on without rigid motions, and
-rigid motions follow. The benchmark counts the solved steps that a rigid motion moves, and the unsolved ones.
+Boxes of 5 to 40 cm and 3e4 to 1e7 Pa fall, slide and tumble on ground with friction of 0 to 2 (float64). They start on
+a face, an edge or in any position. Eight steps of each are solved by 3000 iterations: `Multilevel()` up to friction
+0.3, else `Chebyshev(rho=0.99)`. If one keeps more than 1e-5 of its residual, the reference iterates on without rigid
+motions, and rigid motions follow. The benchmark counts the solved steps that a rigid motion moves, and the unsolved
+ones.
 """
 
 from __future__ import annotations

@@ -45,9 +45,9 @@ class Way(NamedTuple):
 
 BAR = bar(6, 2, 2)
 SMALL, LARGE = dict.fromkeys(DTYPES, 24), {torch.float32: 2304, torch.float64: 960}
-# The smallest that were found for all instantiations. "far" is a grid whose patches have several tetrahedra and several
-# vertices a thread, "large" a stream of such patches, and of one with more slots than a pipeline counts. "several" is
-# "block" in float32 of meshes so small that many environments share blocks.
+# The smallest scenes found for all instantiations. "far" is a grid whose patches have several tetrahedra and vertices
+# per thread. "large" is a stream of such patches, and of one with more slots than a pipeline counts. "several" is
+# "block" in float32 for meshes so small that many environments share blocks.
 WAYS = {
     # of several small ones per block: each with few registers, two with two rounds, two with one
     "several": (Way(bar(4, 2, 2), {}), Way(BAR, {}), Way(bar(2, 2, 2), {})),

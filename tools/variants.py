@@ -6,8 +6,8 @@ Clocks of equal GPUs differ by a tenth, so compare only times of one run. Each p
 applied to a copy of csrc/. The source is recompiled and linked with the other objects unchanged. A patch may therefore
 change kernels and their launches, but no plan, and nothing visible to other sources. The scene is one of
 benchmarks/gpu_scenes.py; --tets are tetrahedra per patch of kernel "stream". The unchanged tree runs first and last. A
-row has microseconds per iteration, of a step of 64 and from 64 to 128 of them, and a hash of the positions after four
-steps, to compare the bits.
+row has microseconds per iteration, of a step of 64 and from 64 to 128 of them. A hash of the positions after four steps
+compares the bits.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Least-squares fit of heights at samples in the ten parameters of each quadric, by Levenberg-Marquardt.
 
 On a fixed base the heights depend only on the positions of the samples: h(x) = sum_i R_i(x). Each sample lies in a few
-quadrics, so the Jacobian is sparse. SciPy's least_squares has no bounds for the radii: on the octopus it takes 5 to 60
+quadrics, so the Jacobian is sparse. SciPy's least_squares has no bounds for the radii. On the octopus it takes 5 to 60
 times as long, and its result is 4 times worse once the bounds are applied.
 """
 
