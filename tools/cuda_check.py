@@ -5,8 +5,9 @@ The C++ sources of a CUDA build get a syntax check.
 The reports of ptxas on registers, spills and shared memory go to build/cuda-check/, one per source. --table FILE writes
 them as one table (CSV) of all kernels; this repository's is benchmarks/results/cuda-registers.csv.
 
---compare FILE compiles nothing: it fails if the table is of other sources or flags. Comments, formatting, file names and
-include paths do not count. ptxas has compiled all sources when the table was written, so CI compares it and uses --quick.
+--compare FILE compiles nothing: it fails if the table is of other sources or flags. Comments, formatting, file names
+and include paths do not count. ptxas has compiled all sources when the table was written, so CI compares it and uses
+--quick.
 
 --quick compiles one architecture per source, in turn, to PTX and, if nvcc can, without optimisation: a thirtieth of the
 work.
