@@ -59,7 +59,7 @@ def blob(points: torch.Tensor) -> torch.Tensor:
     return points.norm(dim=1) - radius
 
 
-def balls(patches: int) -> pd.TriMesh:
+def spheres(patches: int) -> pd.TriMesh:
     """A sphere of 20, 80, 320, ... triangles, connected."""
     return pd.TriMesh.from_trimesh(trimesh.creation.icosphere(subdivisions=round(np.log(patches / 20) / np.log(4))))
 
@@ -115,21 +115,21 @@ def study(name: str, shape: Any, *, quick: bool) -> tuple[float, list[Row]]:
     options = {"bounds": BLOB_BOX} if is_blob else {}
     target = target_of(shape, **options)
     # from the vertices of a base, which needs no bounds of a function
-    size = float(np.ptp(base_triangles(target, balls(1280))[0].bounds, axis=0).max()) if is_blob else target.size
+    size = float(np.ptp(base_triangles(target, spheres(1280))[0].bounds, axis=0).max()) if is_blob else target.size
     fits = (QUICK if quick else FITS)["blob" if is_blob else "other"]
     counts = (80,) if quick else (80, 320, 1280) if is_blob else (100, 200, 400, 800, 1600, 3200)
-    fine = target.mesh() if quick or not is_blob else base_triangles(target, balls(5120))[0]
+    fine = target.mesh() if quick or not is_blob else base_triangles(target, spheres(5120))[0]
     rows = []
     for count in tqdm(counts, desc=f"{name}: triangles", leave=False):
         coarse = simplify(fine, count)
-        mesh = base_triangles(target, balls(count) if is_blob else coarse)[0]
+        mesh = base_triangles(target, spheres(count) if is_blob else coarse)[0]
         rows.append(triangle_row("triangles, vertices on the shape", target, mesh, flat_points, 3))
         rows.append(triangle_row("triangles, least quadric error", target, coarse, flat_points, 3))
         rows.append(triangle_row("PN triangles", target, mesh, pn_points, 5))
     effort: dict[str, Any] = {"iterations": 5} if quick else {}
     settings = [(patches, count, base) for patches, some in fits for count in some for base in ("flat", "phong")]
     for patches, count, base in tqdm(settings, desc=f"{name}: fits", leave=False):
-        over = balls(patches) if is_blob else patches
+        over = spheres(patches) if is_blob else patches
         try:
             report = pd.FreeFormPatches.fit(shape, count, patches=over, base=base, **options, **effort).report
         except ValueError as error:  # the base is too coarse for the shape: nothing to compare

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from compactness import BLOB_BOX, balls, blob
+from compactness import BLOB_BOX, blob, spheres
 from machine import describe_run, measure, multiply_adds_per_second, write_result
 
 import torchpd as pd
@@ -125,7 +125,7 @@ def measure_fit(options: argparse.Namespace) -> list[dict[str, Any]]:
     device = torch.device(options.device)
     patches, quadrics = options.fit
     begin = time.perf_counter()
-    fit = pd.FreeFormPatches.fit(blob, quadrics, patches=balls(patches), bounds=BLOB_BOX)
+    fit = pd.FreeFormPatches.fit(blob, quadrics, patches=spheres(patches), bounds=BLOB_BOX)
     seconds = time.perf_counter() - begin
     fitted = fit.patches.to(device)
     loss = pd.PatchLoss(fitted, blob, bounds=BLOB_BOX)

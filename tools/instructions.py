@@ -48,26 +48,26 @@ def functions_of(listing: str) -> Iterator[tuple[str, dict[int, str]]]:
         yield name, {int(address, 16): words for address, words in _LINE.findall(text)}
 
 
-def ways_of(code: dict[int, str]) -> dict[int, list[int]]:
+def successors_of(code: dict[int, str]) -> dict[int, list[int]]:
     """The possible next addresses of each instruction."""
-    ways: dict[int, list[int]] = {}
+    successors: dict[int, list[int]] = {}
     addresses = list(code)
     for address, following in zip(addresses, addresses[1:] + [-1], strict=True):
         branch = _BRANCH.match(code[address])
         to = [int(branch["target"], 16)] if branch else []
         if not (_END.match(code[address]) or (branch and not branch["first"] and not branch["second"])):
             to.append(following)
-        ways[address] = [way for way in to if way in code]
-    return ways
+        successors[address] = [way for way in to if way in code]
+    return successors
 
 
-def steps_from(ways: dict[int, list[int]], first: int, low: int, high: int) -> dict[int, int]:
+def shortest_distances(successors: dict[int, list[int]], first: int, low: int, high: int) -> dict[int, int]:
     """Least number of steps from `first` to every address reachable within a range."""
     steps, new = {first: 0}, [first]
     while new:
         here, new = new, []
         for address in here:
-            for way in ways[address]:
+            for way in successors[address]:
                 if low <= way <= high and way not in steps:
                     steps[way] = steps[address] + 1
                     new.append(way)
@@ -76,20 +76,20 @@ def steps_from(ways: dict[int, list[int]], first: int, low: int, high: int) -> d
 
 def loops_of(code: dict[int, str]) -> list[Loop]:
     """The loops (backward branches), by their start."""
-    ways = ways_of(code)
-    back: dict[int, list[int]] = {address: [] for address in ways}
-    for address, to in ways.items():
+    successors = successors_of(code)
+    back: dict[int, list[int]] = {address: [] for address in successors}
+    for address, to in successors.items():
         for way in to:
             back[way].append(address)
     loops: dict[int, Loop] = {}
-    for end, to in ways.items():
+    for end, to in successors.items():
         for begin in to:
             if begin > end:
                 continue
-            steps = steps_from(ways, begin, begin, end)
+            steps = shortest_distances(successors, begin, begin, end)
             if end not in steps:  # a branch back from code placed after its function
                 continue
-            size = len(steps.keys() & steps_from(back, end, begin, end).keys())
+            size = len(steps.keys() & shortest_distances(back, end, begin, end).keys())
             known = loops.get(begin, Loop(begin, 0, steps[end] + 1))
             loops[begin] = Loop(begin, max(size, known.all), min(steps[end] + 1, known.least))
     return sorted(loops.values())

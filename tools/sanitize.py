@@ -324,7 +324,7 @@ def launches(seen: profile) -> Counter[str]:
     return Counter(name for name in names if name.startswith("pd::"))
 
 
-def say_what_ran(ran: Counter[str], expected: set[str]) -> bool:
+def report_missing(ran: Counter[str], expected: set[str]) -> bool:
     """Print and return whether exactly the expected kernels ran."""
     for name, times in sorted(ran.items()):
         print(f"{times:7} {name}")
@@ -366,7 +366,7 @@ def main(words: list[str]) -> int:
     if not options.list:
         return 0
     clusters = properties_of(torch.device("cuda", 0)).cluster > 1
-    return 0 if say_what_ran(ran, expected_kernels(clusters=clusters)) else 1
+    return 0 if report_missing(ran, expected_kernels(clusters=clusters)) else 1
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ def crumbs(count: int) -> pd.TetMesh:
     return pd.TetMesh((place[:, None] + corners).reshape(-1, 3), np.arange(4 * count).reshape(-1, 4))
 
 
-class Way(NamedTuple):
+class KernelCase(NamedTuple):
     """A mesh, and constants of `kernel_choice` that determine the number of patches."""
 
     mesh: pd.TetMesh
@@ -50,23 +50,23 @@ SMALL, LARGE = dict.fromkeys(DTYPES, 24), {torch.float32: 2304, torch.float64: 9
 # "block" in float32 for meshes so small that many environments share blocks.
 WAYS = {
     # of several small ones per block: each with few registers, two with two rounds, two with one
-    "several": (Way(bar(4, 2, 2), {}), Way(BAR, {}), Way(bar(2, 2, 2), {})),
+    "several": (KernelCase(bar(4, 2, 2), {}), KernelCase(BAR, {}), KernelCase(bar(2, 2, 2), {})),
     # all vertex arrays in shared memory; not all: in float32, in float64
-    "block": (Way(bar(9, 2, 2), {}), Way(bar(40, 1, 1), {}), Way(bar(4, 2, 2), {})),
+    "block": (KernelCase(bar(9, 2, 2), {}), KernelCase(bar(40, 1, 1), {}), KernelCase(bar(4, 2, 2), {})),
     # four lanes per vertex, with few threads and many; eight, with few and many
     "cluster": (
-        Way(bar(4, 2, 2), {"_CLUSTER_EACH": 60}),
-        Way(bar(4, 4, 2), {"_CLUSTER_EACH": 150}),
-        Way(cones(1), {"_CLUSTER_EACH": 10}),
-        Way(cones(2), {"_CLUSTER_EACH": 40}),
+        KernelCase(bar(4, 2, 2), {"_CLUSTER_EACH": 60}),
+        KernelCase(bar(4, 4, 2), {"_CLUSTER_EACH": 150}),
+        KernelCase(cones(1), {"_CLUSTER_EACH": 10}),
+        KernelCase(cones(2), {"_CLUSTER_EACH": 40}),
     ),
-    "grid": (Way(BAR, {"_MIN_GRID_TETS": 8}),),
-    "far": (Way(bar(99, 1, 1), {"_MIN_GRID_TETS": 594}),),
+    "grid": (KernelCase(BAR, {"_MIN_GRID_TETS": 8}),),
+    "far": (KernelCase(bar(99, 1, 1), {"_MIN_GRID_TETS": 594}),),
     "stream": (
-        Way(BAR, {"_STREAM_TETS": SMALL}),
-        Way(crumbs(9), {"_STREAM_TETS": SMALL}),  # more parts of pieces than a block has warps that move them
+        KernelCase(BAR, {"_STREAM_TETS": SMALL}),
+        KernelCase(crumbs(9), {"_STREAM_TETS": SMALL}),  # more parts of pieces than a block has warps that move them
     ),
-    "large": (Way(bar(19, 20, 1), {"_STREAM_TETS": LARGE}), Way(crumbs(129), {"_STREAM_TETS": LARGE})),
+    "large": (KernelCase(bar(19, 20, 1), {"_STREAM_TETS": LARGE}), KernelCase(crumbs(129), {"_STREAM_TETS": LARGE})),
 }
 KERNELS = tuple(WAYS)
 
@@ -77,7 +77,7 @@ def known_as(kernel: str) -> str:
 
 
 @contextmanager
-def compiled_for(kernel: str, way: Way) -> Iterator[str]:
+def compiled_for(kernel: str, way: KernelCase) -> Iterator[str]:
     """The simulator's name of a kernel of KERNELS, while the patches are those of `way`."""
     with mock.patch.dict(vars(regimes), way.constants):
         yield known_as(kernel)
