@@ -1,8 +1,8 @@
-"""Iterations that one step of a beam needs to reach an error, for three stiffnesses: the tables of docs/accuracy.md.
+"""Iterations of one step of a beam to an error, at three stiffnesses: the tables of docs/accuracy.md.
 
 The beam of the tests: 1 x 0.2 x 0.2 m, 3750 tetrahedra, held at x = 0, thrown downwards with v_y = -10 x^2, time step
-1/30 s, float64. Error |x - x*| / |x_0 - x*| with x* solved by Newton's method, start "inertial".
-Jacobi is that of the source paper (plain diagonal); the classic schedule has the paper's two-stage rho.
+1/30 s, float64. The error is |x - x*| / |x_0 - x*|, with x* from Newton's method and start "inertial".
+Jacobi is the source paper's (plain diagonal); the classic schedule uses the paper's two-stage rho.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def solution(sim: pd.Simulator, state: pd.State) -> Tensor:
 
 
 def iterations_to(sim: pd.Simulator, state: pd.State, solved: Tensor, error: float, most: int) -> int | None:
-    """Fewest iterations, by bisection; None where more than `most` are needed."""
+    """Fewest iterations to an error, by bisection; None if `most` are not enough."""
 
     def error_after(iterations: int) -> float:
         sim.iterations = iterations
@@ -61,7 +61,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--most", type=int, default=5000, help="iterations at most")
     parser.add_argument("--errors", type=float, nargs="+", default=ERRORS, help="to reach (%(default)s)")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args()
     rows = []
     print(f"{'youngs':>8}  {'solver':<20}" + "".join(f"{error:>10.0e}" for error in options.errors))

@@ -1,9 +1,9 @@
-"""Bytes against error: free-form patches beside plain triangles and PN triangles, over the same coarse triangles.
+"""Bytes against error: free-form patches beside plain triangles and PN triangles over the same coarse triangles.
 
-Three shapes: a bumpy blob (a function), the octopus of `torchpd.shapes`, and a mesh of your own. Bytes are float32
-numbers and 16-bit indices (32-bit above 65536 vertices): 3 floats a vertex for triangles, 5 for patches and PN
-triangles (position and normal), 10 a quadric. The error is the distance of the surface from the shape, root of the mean
-square over the area, by the longest side of the shape.
+The three shapes are a bumpy blob (a function), the octopus of `torchpd.shapes`, and your own mesh. Bytes count float32
+numbers and 16-bit indices (32-bit above 65536 vertices). A vertex takes 3 floats in a triangle mesh, and 5 in patches
+and PN triangles (position and normal); a quadric takes 10. The error is the distance of the surface from the shape,
+root mean square over the area, relative to the longest side of the shape.
 
 PN triangles: Vlachos et al. (2001), with the shape's own normals at their vertices.
 """
@@ -39,7 +39,7 @@ STYLES = {
     "patches, flat base": ("#e69f00", "o"),
     "patches, phong base": ("#d55e00", "o"),
 }
-# of the patches and quadrics that are fitted
+# sizes of the fits: patches and quadrics
 FITS = {
     "blob": ((20, (20, 40, 60)), (80, (60, 120))),
     "other": ((200, (60,)), (300, (90,)), (600, (120,))),
@@ -48,7 +48,7 @@ QUICK = {"blob": ((20, (8,)),), "other": ((100, (8,)),)}
 
 
 def blob(points: torch.Tensor) -> torch.Tensor:
-    """A ball of radius 1 with fourteen bumps and dents: negative inside."""
+    """A ball of radius 1 with fourteen bumps and dents; negative inside."""
     rng = np.random.default_rng(3)
     ways = points / points.norm(dim=1, keepdim=True).clamp_min(1e-9)
     radius = torch.ones_like(points[:, 0])
@@ -59,25 +59,25 @@ def blob(points: torch.Tensor) -> torch.Tensor:
     return points.norm(dim=1) - radius
 
 
-def balls(patches: int) -> pd.TriMesh:
-    """A ball of 20, 80, 320, ... triangles, in one piece."""
+def spheres(patches: int) -> pd.TriMesh:
+    """A sphere of 20, 80, 320, ... triangles, connected."""
     return pd.TriMesh.from_trimesh(trimesh.creation.icosphere(subdivisions=round(np.log(patches / 20) / np.log(4))))
 
 
 def distances(target: FitTarget, points: Array, triangle_shares: Array) -> tuple[float, float]:
-    """Root of the mean square and largest distance of points, each standing for a share of the area."""
+    """Root mean square and largest distance of points, weighted by their shares of the area."""
     distance = target.near(points)[0]
     weights = triangle_shares / triangle_shares.sum()
     return float(np.sqrt((weights * distance**2).sum())), float(np.abs(distance).max())
 
 
 def flat_points(corners: Array, normals: Array, b: Array) -> Array:
-    """[P, n, 3] of plain triangles [P, 3, 3]."""
+    """Points [P, n, 3] of plain triangles [P, 3, 3]."""
     return np.asarray(np.einsum("nk,pkx->pnx", b, corners))
 
 
 def pn_points(corners: Array, normals: Array, b: Array) -> Array:
-    """[P, n, 3] of PN triangles: the cubic whose edges leave the corners at right angles to their normals."""
+    """Points [P, n, 3] of PN triangles: the cubic whose edges leave the corners at right angles to their normals."""
     powers = [b[:, k, None] for k in range(3)]
     out = sum(powers[k] ** 3 * corners[:, None, k] for k in range(3))
     edges = []
@@ -97,7 +97,7 @@ def pn_points(corners: Array, normals: Array, b: Array) -> Array:
 def triangle_row(
     name: str, target: FitTarget, mesh: pd.TriMesh, points_of: Callable[[Array, Array, Array], Array], floats: int
 ) -> Row:
-    """Errors at places inside of every triangle, their share of the area that of the flat triangle."""
+    """Errors at points inside every triangle, weighted by the area of the flat triangle."""
     corners = mesh.vertices[mesh.triangles]
     normals = target.near(mesh.vertices)[2][mesh.triangles]
     level = int(np.clip(np.sqrt(12000 / len(corners)), 2, 12))
@@ -110,29 +110,29 @@ def triangle_row(
 
 
 def study(name: str, shape: Any, *, quick: bool) -> tuple[float, list[Row]]:
-    """Size of a shape [m] and all rows of it, errors in m."""
+    """Size of a shape [m] and its rows, with errors in m."""
     is_blob = name == "blob"
     options = {"bounds": BLOB_BOX} if is_blob else {}
     target = target_of(shape, **options)
-    # by the vertices of a base, which do not know the bounds of a function
-    size = float(np.ptp(base_triangles(target, balls(1280))[0].bounds, axis=0).max()) if is_blob else target.size
+    # from the vertices of a base, which needs no bounds of a function
+    size = float(np.ptp(base_triangles(target, spheres(1280))[0].bounds, axis=0).max()) if is_blob else target.size
     fits = (QUICK if quick else FITS)["blob" if is_blob else "other"]
     counts = (80,) if quick else (80, 320, 1280) if is_blob else (100, 200, 400, 800, 1600, 3200)
-    fine = target.mesh() if quick or not is_blob else base_triangles(target, balls(5120))[0]
+    fine = target.mesh() if quick or not is_blob else base_triangles(target, spheres(5120))[0]
     rows = []
     for count in tqdm(counts, desc=f"{name}: triangles", leave=False):
         coarse = simplify(fine, count)
-        mesh = base_triangles(target, balls(count) if is_blob else coarse)[0]
+        mesh = base_triangles(target, spheres(count) if is_blob else coarse)[0]
         rows.append(triangle_row("triangles, vertices on the shape", target, mesh, flat_points, 3))
         rows.append(triangle_row("triangles, least quadric error", target, coarse, flat_points, 3))
         rows.append(triangle_row("PN triangles", target, mesh, pn_points, 5))
     effort: dict[str, Any] = {"iterations": 5} if quick else {}
     settings = [(patches, count, base) for patches, some in fits for count in some for base in ("flat", "phong")]
     for patches, count, base in tqdm(settings, desc=f"{name}: fits", leave=False):
-        over = balls(patches) if is_blob else patches
+        over = spheres(patches) if is_blob else patches
         try:
             report = pd.FreeFormPatches.fit(shape, count, patches=over, base=base, **options, **effort).report
-        except ValueError as error:  # a base too coarse for the shape: nothing to compare
+        except ValueError as error:  # the base is too coarse for the shape: nothing to compare
             tqdm.write(f"{name}, {patches} patches, {count} quadrics, {base} base: {error}")
             continue
         chosen = {k: v for k, v in asdict(report).items() if k != "size"}
@@ -151,7 +151,7 @@ def table(rows: list[Row]) -> str:
 
 
 def lower_hull(rows: list[Row]) -> list[Row]:
-    """Rows that none of the same or fewer bytes beats, by bytes."""
+    """Rows that no row of the same or fewer bytes beats, by bytes."""
     kept: list[Row] = []
     for row in sorted(rows, key=lambda r: (r["bytes"], r["rms"])):
         if not kept or row["rms"] < kept[-1]["rms"]:
@@ -160,7 +160,7 @@ def lower_hull(rows: list[Row]) -> list[Row]:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """One panel a shape: all rows as points, the best of each method joined."""
+    """Draw one panel per shape: all rows as points, the best of each method connected."""
     from matplotlib.figure import Figure
 
     shapes = list(dict.fromkeys(row["shape"] for row in rows))
@@ -194,9 +194,9 @@ def draw(rows: list[Row], path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("meshes", nargs="*", type=Path, help="surfaces or tetrahedral meshes to study too")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
-    parser.add_argument("--picture", type=Path, help="file for the picture (PNG)")
-    parser.add_argument("--quick", action="store_true", help="few and short fits: only to see that it runs")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
+    parser.add_argument("--picture", type=Path, help="picture file (PNG)")
+    parser.add_argument("--quick", action="store_true", help="few and short fits, only to check that it runs")
     options = parser.parse_args()
     shapes: dict[str, Any] = {"blob": blob, "octopus": pd.shapes.octopus(cells=16 if options.quick else 24)}
     shapes |= {path.stem: pd.TriMesh.from_file(path) for path in options.meshes}

@@ -1,10 +1,11 @@
-"""What a step costs that touches something: iterations and milliseconds to three errors, smooth and rough.
+"""Cost of a step with contacts: iterations and milliseconds to three errors, with and without friction.
 
-A cube that lands and one that slides, a slab that slides, a cube that falls on a ball, of 1e5 to 1e7 Pa, 1/60 s, some
-steps into the motion, smooth or with a friction of 0.5, where some vertices stick and others slide. Iterations are the
-fewest of a grid of four an octave, in float64; errors are |x - x*| / |x + h v - x*|, x* the step after as many
-iterations of `Multilevel` as bring its residual to 1e-9, 10,800 at most (then marked by ?). Milliseconds are medians of
-so many iterations in float32.
+Scenes: a cube that lands, one that slides, a slab that slides, and a cube that falls on a sphere. Young's moduli are
+1e5 to 1e7 Pa, the time step is 1/60 s, some steps into the motion. Contacts are frictionless or have a coefficient of
+0.5, where some vertices stick and others slide. Iterations are the fewest of a grid of four per octave, in float64.
+
+Errors are |x - x*| / |x + h v - x*|. `Multilevel` solves x* to a residual of 1e-9 in at most 10,800 iterations; rows
+above that residual are marked by ?. Milliseconds are medians of the found numbers of iterations in float32.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ H = 1 / 60
 
 
 class Subject(NamedTuple):
-    """A body of cells `shape` times as many, what it meets, how it moves at first and for how many steps."""
+    """A body of `shape` times as many cells, its contact, its initial motion and number of steps."""
 
     shape: tuple[int, int, int]
     size: tuple[float, float, float]
@@ -59,7 +60,7 @@ def made(subject: Subject, cells: int, youngs: float, friction: float, dtype: to
 
 @torch.no_grad()
 def compare(name: str, cells: int, youngs: float, friction: float, device: str, seconds: float) -> dict[str, Any]:
-    """A row: iterations and milliseconds of each solver to each error, None where `COUNTS` do not suffice."""
+    """A row: iterations and milliseconds of each solver to each error, None if `COUNTS` are not enough."""
     subject = SUBJECTS[name]
     sim = made(subject, cells, youngs, friction, torch.float64, device)
     state = sim.rest_state()
@@ -95,7 +96,7 @@ def compare(name: str, cells: int, youngs: float, friction: float, device: str, 
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """Iterations and milliseconds, a row a line."""
+    """Table of iterations and milliseconds, one row per line."""
     goals = ", ".join(f"{error:g}" for error in ERRORS)
     head = f"{'scene':<13}{'vertices':>9}{'Pa':>7}{'friction':>9}"
     lines = [head + "".join(f"   {name + ': it. and ms to ' + goals:<42}" for name in SOLVERS)]
@@ -110,17 +111,17 @@ def table(rows: list[dict[str, Any]]) -> str:
             text += "   " + "".join(f"{cell:>14}" for cell in cells)
         lines.append(text)
     if any(row["residual"] > SOLVED for row in rows):
-        lines.append(f"? converged to a residual above {SOLVED:g} only: errors near that are no errors")
+        lines.append(f"? converged only to a residual above {SOLVED:g}: ignore errors near that")
     return "\n".join(lines)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cells", type=int, nargs="+", default=[2, 4], help="cells an edge, times those of the body")
+    parser.add_argument("--cells", type=int, nargs="+", default=[2, 4], help="cells per edge, times those of the body")
     parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=0.05, help="to time each step for (%(default)s)")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=0.05, help="duration of timing a step (%(default)s)")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     ways = list(itertools.product(SUBJECTS, options.cells, STIFFNESSES, FRICTIONS))

@@ -17,8 +17,8 @@ from torchpd.viewing.animation import write_film
 ROOT = Path(__file__).resolve().parents[1]
 STUDY = ROOT / "benchmarks" / "results" / "study-beam" / "study.csv"
 STIFFNESS = 1e6  # Pa
-LOWEST, MOST = 1e-6, 60.0  # error and milliseconds that are drawn
-# method of the study and its precision: colour, width and style of its line, its name
+LOWEST, MOST = 1e-6, 60.0  # smallest error and largest milliseconds drawn
+# method of the study and its precision: colour, width and style of its line, its label
 CURVES = {
     ("Jacobi", "float32"): ("#3e4046", 2.0, "solid", "Jacobi"),
     ("guarded Chebyshev", "float32"): ("#d55e00", 2.8, "solid", "Chebyshev (star: the default)"),
@@ -30,7 +30,7 @@ CURVES = {
 
 
 def curves(study: Path = STUDY) -> dict[tuple[str, str], list[tuple[float, float, bool]]]:
-    """Milliseconds, error and whether it is the default, of every method drawn, by iterations."""
+    """Milliseconds, error and default flag of every drawn method, by iterations."""
     found: dict[tuple[str, str], list[tuple[float, float, bool]]] = {key: [] for key in CURVES}
     with study.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -42,7 +42,7 @@ def curves(study: Path = STUDY) -> dict[tuple[str, str], list[tuple[float, float
 
 
 def draw(out: Path, study: Path = STUDY) -> None:
-    """Error of a step against its time, one curve a method."""
+    """Draw the error of a step against its time, one curve per method."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 4.0), dpi=100, layout="constrained")
@@ -64,7 +64,7 @@ def draw(out: Path, study: Path = STUDY) -> None:
 
 
 def film(source: Path, out: Path, *, width: int = 360, every: int = 3) -> None:
-    """A small film that repeats: every third picture of 30 a second."""
+    """Write a small repeating film: every third picture of 30 per second."""
     import imageio_ffmpeg
     from PIL import Image
 

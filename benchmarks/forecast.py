@@ -1,8 +1,9 @@
-"""Are forecasts of iterations right, and does `solver="auto"` reach its 1e-3? On random scenes, in float64.
+"""Accuracy of the estimates of iterations, and of `solver="auto"` at its 1e-3: random scenes, in float64.
 
-The scenes of `tune.py` with other random numbers: bars, slivers, balls and octopuses of 60 to 1700 vertices, 1e3 to
-1e8 Pa, time steps of 1 to 33 ms, held, free or on the ground, some steps into a random motion, friction left out.
-Iterations are counted on a grid of four an octave. Scenes that were measured are kept: a run that was stopped goes on.
+The scenes are those of `tune.py` with other random numbers: bars, slivers, balls and octopuses of 60 to 1700 vertices,
+1e3 to 1e8 Pa, time steps of 1 to 33 ms. Bodies are held, free or on the ground, some steps into a random motion,
+without friction. Iterations are counted on a grid of four per octave. Measured scenes are kept: an interrupted run
+resumes.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from torchpd.estimate.solver_choice import AIM
 ERRORS = (1e-1, 1e-2, 1e-3)
 COUNTS = sorted({round(2.0 ** (k / 4)) for k in range(49)})  # to 4096
 SOLVERS = {"Chebyshev": pd.Chebyshev(), "Multilevel": pd.Multilevel()}
-SURE = 1e-4  # of the error, that the converged step itself may have
+SURE = 1e-4  # largest uncertainty of the converged step, relative to the error
 SEED = 77
 Row = dict[str, Any]
 
@@ -33,7 +34,7 @@ def error_of(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> float:
 
 
 def counts_to(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> list[int | None]:
-    """The first of `COUNTS` within each of `ERRORS`; None where that takes more."""
+    """The first of `COUNTS` within each of `ERRORS`; None if they are not enough."""
     found: list[int | None] = []
     for count in COUNTS:
         sim.iterations = count
@@ -71,7 +72,7 @@ def run_scene(number: int) -> Row:
 
 
 def summary(rows: list[Row]) -> Row:
-    """Percentiles of iterations needed over forecast, with and without contacts, and how often auto reached its aim."""
+    """Percentiles of iterations needed over estimate, with and without contacts; and how often auto reached its aim."""
     used = [row for row in rows if "left_out" not in row]
     out: Row = {"scenes": len(used), "left out": len(rows) - len(used)}
     for place, group in (
@@ -82,7 +83,7 @@ def summary(rows: list[Row]) -> Row:
             last = len(ERRORS) - 1
             ratios = [
                 (row[name]["needed"][last] or np.inf) / row[name]["forecast"][last] for row in group
-            ]  # none needed: worse than all
+            ]  # None counts as worse than all
             out[f"{name}, {place}: needed / forecast to {ERRORS[last]:g}"] = {
                 f"{p} %": float(np.percentile(ratios, p, method="lower")) for p in (5, 50, 90, 95)
             }

@@ -1,12 +1,12 @@
-"""What a training step costs where a body slides against friction, and where it rests on the ground.
+"""Cost of a training step for a body that slides with friction, and for one that rests on the ground.
 
 A cube of 125 or 1000 vertices, float32, 1e5 Pa, time step 1/60 s, 64 iterations; friction 0.4. The loss is the sum of
-squares of the new positions, and forces, velocities and stiffness are asked for their gradients. Milliseconds are
-medians, device awaited: forward and both as Python calls them, then in a CUDA graph, and what the device starts
-for both. The last row compares the memory of a rollout of ten steps with that of a loop.
+squares of the new positions, with gradients by forces, velocities and stiffness. Milliseconds are medians, with the
+device awaited: forward, and forward plus backward, from Python and in a CUDA graph. Kernel launches are counted for
+both. The last row compares the memory of a rollout of ten steps with that of a loop.
 
     python benchmarks/friction_gradients.py --device cuda --out benchmarks/results/friction-gradients-cuda.json
-    python benchmarks/friction_gradients.py --device cuda --adjoint multilevel     # which takes kernel "stream"
+    python benchmarks/friction_gradients.py --device cuda --adjoint multilevel     # uses kernel "stream"
     PYTHONPATH=../other-checkout python benchmarks/friction_gradients.py --device cuda
 """
 
@@ -30,7 +30,7 @@ Row = dict[str, Any]
 def cube(
     cells: int, batch: int, speed: float, device: torch.device, adjoint: str = "solver"
 ) -> tuple[pd.Simulator, pd.State]:
-    """On the ground, that fast along it for a few steps by now."""
+    """A cube on the ground, after a few steps of sliding at this speed."""
     body = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (cells, cells, cells)), 1e5, density=1000.0)
     scene = pd.Scene(body, pd.Gravity(), pd.Damping(0.5), pd.Ground(0.0, friction=0.4))
     kernel = "stream" if adjoint == "multilevel" else "auto"
@@ -44,7 +44,7 @@ def cube(
 
 
 def sliding_vertices(sim: pd.Simulator, state: pd.State) -> float:
-    """Of an environment, on average."""
+    """Mean number of sliding vertices per environment."""
     after = sim(state).positions.detach()
     material, still = [array.detach() for array in sim.material()], torch.zeros_like(after)
     *_, sliding = torch.ops.torchpd.adjoint_system(
@@ -93,7 +93,7 @@ def training_row(
 
 
 def memory_row(batch: int, device: torch.device) -> Row:
-    """Bytes at most, above what there was, of ten steps and back."""
+    """Peak bytes of ten steps forward and backward, above the bytes before."""
     sim, state = cube(4, batch, 3.0, device)
     v = state.velocities.clone().requires_grad_()
     start = type(state)(state.positions, v)
@@ -123,9 +123,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 64, 1024])
-    parser.add_argument("--cells", type=int, nargs="+", default=[4, 9], help="of an edge of the cube (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=0.3, help="of each time (%(default)g)")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--cells", type=int, nargs="+", default=[4, 9], help="cells per edge of the cube (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=0.3, help="duration of each timing (%(default)g)")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     parser.add_argument("--adjoint", choices=("solver", "multilevel"), default="solver", help="(%(default)s)")
     options = parser.parse_args()
     print(f"torchpd of {Path(pd.__file__).parent}, on {options.device}")

@@ -1,4 +1,4 @@
-"""`run.py --device cuda`: rows for the scenes of gpu_scenes.py, what a call costs, and the tests of the paper."""
+"""`run.py --device cuda`: rows for the scenes of gpu_scenes.py, the cost of a call, and the tests of the paper."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from torchpd.study.axes import PAPER_TESTS
 
 Row = dict[str, Any]
 
-ROLLOUT = 16  # steps in one call
+ROLLOUT = 16  # steps per call
 
 
 @contextmanager
 def turn(device: torch.device) -> Iterator[None]:
-    """Of this process on a GPU: runs side by side prepare their scenes together, and measure one after another."""
+    """Exclusive use of a GPU among processes: parallel runs prepare scenes together, and measure one at a time."""
     with (Path(tempfile.gettempdir()) / f"torchpd-benchmark-{device.index or 0}.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
 
 
 def quantities(scene: GpuScene, tets: int, step: float, twice: float) -> Row:
-    """What follows from the seconds of a step with K and with 2 K iterations."""
+    """Rates derived from the seconds of a step with K and with 2 K iterations."""
     return {
         "step_microseconds": 1e6 * step,
         "iteration_microseconds": 1e6 * step / scene.iterations,
@@ -50,7 +50,7 @@ def quantities(scene: GpuScene, tets: int, step: float, twice: float) -> Row:
 
 
 def floors(scene: GpuScene, facts: Row, device: Device, dtype: torch.dtype, step: float) -> Row:
-    """Shares of an iteration's time that instructions, and with the stream kernels memory, take at the very least."""
+    """Least shares of an iteration's time for instructions and, with the stream kernels, for memory."""
     iteration = step / scene.iterations
     real = torch.finfo(dtype).bits // 8
     single = dtype == torch.float32  # float64 issues other instructions
@@ -62,7 +62,7 @@ def floors(scene: GpuScene, facts: Row, device: Device, dtype: torch.dtype, step
 
 
 def aims(scene: GpuScene, row: Row, dtype: torch.dtype) -> list[Row]:
-    """The goals, and the share of the lower one that was reached: 1 or more is good."""
+    """The goals, and the fraction reached of the lower one; 1 or more is good."""
     if dtype != torch.float32:
         return []
     return [
@@ -77,12 +77,12 @@ def aims(scene: GpuScene, row: Row, dtype: torch.dtype) -> list[Row]:
 
 
 def kernel_on(kernel: str, device: torch.device) -> str:
-    """A grid in place of a cluster where a GPU has none."""
+    """Replace a cluster by a grid on a GPU without clusters."""
     return "grid" if kernel == "cluster" and properties_of(device).cluster == 1 else kernel
 
 
 def compile_on(scene: GpuScene, dtype: torch.dtype, device: torch.device) -> tuple[pd.Simulator, Row]:
-    """The simulator, and what compiling it took: `plan_seconds` for the CPU's plan and the device's together."""
+    """The simulator and its compile time; `plan_seconds` covers the CPU's plan and the device's."""
     parts = scene.build()
     gc.collect()
     torch.cuda.empty_cache()
@@ -105,7 +105,7 @@ def compile_on(scene: GpuScene, dtype: torch.dtype, device: torch.device) -> tup
 
 
 def measure_scene(scene: GpuScene, dtype: torch.dtype, machine: Device, options: argparse.Namespace) -> Row:
-    """One row of the result; rates come from the median."""
+    """Measure one row of the result; rates come from the median."""
     sim, facts = compile_on(scene, dtype, torch.device(options.device))
     with turn(sim.device):
         row = measure_steps(scene, sim, facts, machine, options)
@@ -113,7 +113,7 @@ def measure_scene(scene: GpuScene, dtype: torch.dtype, machine: Device, options:
 
 
 def measure_steps(scene: GpuScene, sim: pd.Simulator, facts: Row, machine: Device, options: argparse.Namespace) -> Row:
-    """Times and bytes of its steps."""
+    """Times and bytes of the steps."""
     dtype = sim.dtype
     state = scene.start(sim)
     given = {"repetitions": options.repetitions, "seconds": options.seconds}
@@ -148,7 +148,7 @@ def measure_steps(scene: GpuScene, sim: pd.Simulator, facts: Row, machine: Devic
 
 
 def measure_calls(options: argparse.Namespace) -> Row:
-    """Microseconds of a call: the host's part, a run in a graph, the kernels alone. One iteration, one tetrahedron."""
+    """Microseconds of a call with one iteration on one tetrahedron: host, in a graph, kernels alone."""
     runs = 5 if options.quick else 200
     found: Row = {}
     for kernel in dict.fromkeys(kernel_on(name, torch.device(options.device)) for name in KERNELS):
@@ -171,7 +171,7 @@ def measure_calls(options: argparse.Namespace) -> Row:
 
 
 def measure_paper(options: argparse.Namespace) -> list[Row]:
-    """Scenes of as many tetrahedra as the paper's have constraints, with 64 iterations."""
+    """Scenes with as many tetrahedra as the paper's have constraints, with 64 iterations."""
     return [measure_test(*test, kernel, options) for test in PAPER_TESTS for kernel in ("block", "cluster")]
 
 
@@ -196,7 +196,7 @@ def measure_test(
 
 
 def table(rows: list[Row]) -> str:
-    """The rows for a reader."""
+    """Format the rows as a table."""
     lines = [
         ["scene", "dtype", "kernel", "tets", "batch", "K", "us/step", "us/it", "marginal", "eager us", "rollout us",
          "G tet-it/s", "k steps/s", "of must", "issue", "bandwidth", "plan s", "peak MB", "B/vertex"]
@@ -230,7 +230,7 @@ def table(rows: list[Row]) -> str:
 
 
 def put(rows: list[Row], row: Row) -> None:
-    """A row in its place: that of its scene in GPU_SCENES, instead of an earlier one of that scene and precision."""
+    """Insert a row in the order of GPU_SCENES, replacing an earlier one of that scene and precision."""
     names = [scene.name for scene in GPU_SCENES]
     rows[:] = [other for other in rows if (other["scene"], other["dtype"]) != (row["scene"], row["dtype"])]
     rows.append(row)
@@ -238,19 +238,19 @@ def put(rows: list[Row], row: Row) -> None:
 
 
 def with_earlier(result: Row, earlier: Row) -> Row:
-    """A result, and from an earlier one what this run has not measured."""
+    """A result, completed with the rows of an earlier one that this run has not measured."""
     whole = {**result, "results": [*earlier.get("results", [])]}
     for row in result["results"]:
         put(whole["results"], row)
     if not result["call_microseconds"]:
         whole.update({name: earlier[name] for name in ("call_microseconds", "call_run") if name in earlier})
     whole["paper"] = result["paper"] or earlier.get("paper", [])
-    # each row says where it comes from, and the whole comes from several runs
+    # each row names its run, since the file may combine several
     return {name: value for name, value in whole.items() if name not in PROVENANCE}
 
 
 def run_on_gpu(options: argparse.Namespace, result: Row, keep: Callable[[], None]) -> None:
-    """Everything, into the result and printed."""
+    """Measure everything; store it in the result and print it."""
     device = torch.device(options.device)
     options.run = run_of(result)
     result.update({"call_microseconds": {}, "paper": [], "results": []})

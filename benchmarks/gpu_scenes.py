@@ -1,4 +1,4 @@
-"""What is measured on a GPU: bars from 64 to 4 M vertices, regular and irregular, alone and in batches, with goals."""
+"""GPU benchmark scenes: bars from 64 to 4 M vertices, regular and irregular, single and in batches, with goals."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ import torchpd as pd
 
 SIZE = (1.0, 0.2, 0.2)  # m
 ITERATIONS = 64
-_SLAB, _MARGIN = 32, 6.0  # cells of a bar whose Delaunay tetrahedra one process finds, and that it sees beside them
+_SLAB, _MARGIN = 32, 6.0  # cells per slab of a bar, triangulated by one process, and cells that it sees beside them
 _SLIVER = 0.01  # volume in cells
 
 
 @dataclass(frozen=True)
 class Aim:
-    """What an H100 must reach in float32, and what it should: rates as high, times as low as that."""
+    """Required and desired performance of an H100 in float32: minima of rates, maxima of times."""
 
     quantity: str  # a number of a row: a rate, or microseconds
     must: float
@@ -34,17 +34,17 @@ class Aim:
         return self.quantity.endswith("microseconds")
 
     def share(self, value: float) -> float:
-        """Of `must`: 1 or more is reached."""
+        """Fraction reached of `must`; 1 or more is good."""
         return self.must / value if self.is_time else value / self.must
 
 
 def regular_bar(cells: tuple[int, int, int]) -> pd.TetMesh:
-    """Kuhn's six tetrahedra a cell."""
+    """A bar with Kuhn's six tetrahedra per cell."""
     return pd.shapes.box(SIZE, cells)
 
 
 def five_tet_bar(cells: tuple[int, int, int]) -> pd.TetMesh:
-    """Five tetrahedra a cell: one on every other corner, and the four corners left; neighbours are mirrored."""
+    """A bar with five tetrahedra per cell: one on alternate corners and the four others; neighbours are mirrored."""
     grid = regular_bar(cells)
     i, j, k = np.meshgrid(*(np.arange(count) for count in cells), indexing="ij")
     odd = ((i + j + k) % 2).reshape(-1, 1)
@@ -60,14 +60,14 @@ def five_tet_bar(cells: tuple[int, int, int]) -> pd.TetMesh:
 
 
 def _delaunay_slab(points: NDArray[np.float64], low: float, high: float) -> NDArray[np.int64]:
-    """Delaunay tetrahedra of all points whose spheres have their centres at low <= x < high.
+    """Delaunay tetrahedra of all points whose circumspheres have centres at low <= x < high.
 
-    A sphere within the layers that are looked at is empty of all points, so these are those of the whole. Spheres as
-    large as the margin are those of slivers on a wall, which are left out in the end.
+    A sphere within the visible layers contains no other point, so these tetrahedra are those of the whole mesh. Spheres
+    as large as the margin belong to slivers on a wall, which are removed at the end.
     """
     near = np.flatnonzero((points[:, 0] > low - _MARGIN) & (points[:, 0] < high + _MARGIN))
     tets = near[Delaunay(points[near]).simplices.astype(np.int64)]
-    # in an order that neighbouring slabs share, lest they round a centre to different sides
+    # in an order common to neighbouring slabs: otherwise they might round a centre to different sides
     corners = points[np.sort(tets, axis=1)]
     edges = corners[:, 1:] - corners[:, :1]
     flat = np.abs(np.linalg.det(edges)) / 6.0 <= _SLIVER
@@ -76,22 +76,22 @@ def _delaunay_slab(points: NDArray[np.float64], low: float, high: float) -> NDAr
     centre = corners[:, 0, 0] + arms[:, 0]
     own = ~flat & (centre >= low) & (centre < high)
     if np.linalg.norm(arms[own], axis=1).max(initial=0.0) > _MARGIN:
-        raise RuntimeError("a sphere reaches past the margin: take a larger one")
+        raise RuntimeError("_MARGIN must exceed every circumsphere, got one beyond it; raise _MARGIN")
     return tets[own]
 
 
 def _in_slabs(points: NDArray[np.float64], cells: int) -> NDArray[np.int64]:
-    """Delaunay tetrahedra of points with 0 <= x <= cells, by several processes: in a script behind its __main__."""
-    # squares of the walls have several triangulations, with one sphere, whose centre is at multiples of 1/2
+    """Delaunay tetrahedra of points with 0 <= x <= cells, by several processes; needs a `__main__` guard in scripts."""
+    # a square on a wall has several triangulations with one sphere, whose centre is a multiple of 1/2
     edges = [-np.inf, *(np.arange(_SLAB, cells, _SLAB) + 0.25), np.inf]
     with ProcessPoolExecutor(min(len(edges) - 1, len(os.sched_getaffinity(0))), get_context("spawn")) as pool:
         return np.concatenate(list(pool.map(partial(_delaunay_slab, points), edges[:-1], edges[1:])))
 
 
 def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
-    """Delaunay tetrahedra of the corners of the cells, each moved by up to 0.3 of a cell, without slivers.
+    """Delaunay tetrahedra of the cell corners, each moved by up to 0.3 of a cell, without slivers.
 
-    Vertices have 4 to some 40 tetrahedra, and lie in memory in random order, as those of meshes from elsewhere do.
+    Vertices have 4 to about 40 tetrahedra. Their order in memory is random, as in meshes from other software.
     """
     rng = np.random.default_rng(seed)
     axes = [np.arange(count + 1.0) for count in cells]
@@ -101,7 +101,7 @@ def irregular_bar(cells: tuple[int, int, int], *, seed: int = 0) -> pd.TetMesh:
     points = rng.permutation(points + shift)
     tets = _in_slabs(points, cells[0]) if cells[0] > _SLAB else Delaunay(points).simplices.astype(np.int64)
     volume = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) / 6.0
-    # in units of a cell, where Kuhn's tetrahedra have 1/6
+    # in units of a cell, in which Kuhn's tetrahedra have a volume of 1/6
     tets = np.where((volume < 0.0)[:, None], tets[:, [0, 2, 1, 3]], tets)[np.abs(volume) > _SLIVER]
     used, compact = np.unique(tets, return_inverse=True)
     return pd.TetMesh(points[used] / cells * SIZE, compact.reshape(-1, 4))
@@ -116,7 +116,7 @@ def _suffix(mesh: str) -> str:
 
 @dataclass(frozen=True)
 class GpuScene:
-    """Copies of a bar that is held at one end, swings, and bends by its weight, or that is loose."""
+    """Copies of a bar, held at one end where it swings and bends by its weight, or free."""
 
     name: str
     cells: tuple[int, int, int]
@@ -125,10 +125,10 @@ class GpuScene:
     mesh: str = "regular"
     iterations: int = ITERATIONS
     aims: tuple[Aim, ...] = ()
-    heavy: bool = False  # minutes to prepare: only when asked for
-    effects: bool = False  # all that a solid may meet: it rests on a ball, over ground, both rough, and is damped
+    heavy: bool = False  # takes minutes to prepare: only on request
+    effects: bool = False  # all effects of a solid: rests on a sphere over ground, both with friction, and is damped
     loose: bool = False  # held by nothing
-    ground: bool = False  # lies on a smooth plane
+    ground: bool = False  # lies on a frictionless plane
 
     def build(self) -> pd.Scene:
         """The scene of one environment."""
@@ -168,17 +168,17 @@ def _pair(name: str, cells: tuple[int, int, int], kernel: str, aim: Aim, *, heav
 
 
 def _as_many_tets(name: str, cells: tuple[int, int, int], kernel: str, aim: Aim, *, heavy: bool = False) -> GpuScene:
-    """An irregular mesh of as many tetrahedra as the regular one, which for as many vertices has 12 % more."""
+    """An irregular mesh with as many tetrahedra as the regular one, which has 12 % more for as many vertices."""
     return GpuScene(f"{name}-irregular-as-many-tets", cells, kernel=kernel, mesh="irregular", aims=(aim,), heavy=heavy)
 
 
 def _iteration(must: float, stretch: float | None = None) -> Aim:
-    # goals of prototypes that timed iterations alone; what a step costs beside them has a column of its own
+    # goals from prototypes that timed only iterations; the rest of a step has a column of its own
     return Aim("marginal_iteration_microseconds", must, stretch)
 
 
 def _loose(name: str, cells: tuple[int, int, int], batch: int = 1, kernel: str = "auto") -> list[GpuScene]:
-    """The same, free and on the ground."""
+    """The same bar, free and on the ground."""
     return [
         GpuScene(f"{name}-{suffix}", cells, batch, kernel, loose=True, ground=suffix == "ground")
         for suffix in ("free", "ground")

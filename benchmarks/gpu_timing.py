@@ -1,4 +1,4 @@
-"""Times on a GPU: events around work that a CUDA graph has recorded, so that the host does not enter."""
+"""GPU times from events around work in a CUDA graph, which excludes the host."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ import torch
 
 Work = Callable[[], object]
 
-DEFAULT_CLOCK = 1.98e9  # Hz, of an H100 SXM at its highest
-LANES = 4 * 32  # instructions that a multiprocessor issues a clock, times threads of a warp
-INSTRUCTIONS = 202.0  # a tetrahedron and iteration in float32, of kernel "block": tools/instructions.py fused_float
-STREAM_BYTES = 244.0  # of a vertex and iteration in float32, with kernels for every iteration: the arrays of one-1M
+DEFAULT_CLOCK = 1.98e9  # Hz, highest clock of an H100 SXM
+LANES = 4 * 32  # instructions issued per clock and multiprocessor, times threads of a warp
+INSTRUCTIONS = 202.0  # per tetrahedron and iteration in float32, kernel "block": tools/instructions.py fused_float
+STREAM_BYTES = 244.0  # per vertex and iteration in float32, with one kernel per iteration: the arrays of one-1M
 
 
 @dataclass(frozen=True)
 class Device:
-    """What the floors follow from."""
+    """Facts of a GPU that determine the lower bounds."""
 
     name: str
     multiprocessors: int
     clock: float  # Hz
-    copy_bandwidth: float  # bytes/s, read and written
+    copy_bandwidth: float  # bytes/s, read plus written
     memory: int
 
     @property
     def lane_instructions(self) -> float:
-        """A second, when every scheduler issues one a clock."""
+        """Lane instructions per second, with every scheduler issuing one per clock."""
         return self.multiprocessors * LANES * self.clock
 
     def issue_floor(self, tets: int, batch: int) -> float:
-        """Seconds of an iteration when nothing but instructions takes time."""
+        """Lower bound [s] of an iteration from its instructions."""
         return INSTRUCTIONS * tets * batch / self.lane_instructions
 
     def bandwidth_floor(self, vertices: int, batch: int, real: int) -> float:
-        """Seconds of an iteration of the stream kernels when nothing but memory takes time."""
+        """Lower bound [s] of an iteration of the stream kernels from its memory traffic."""
         return STREAM_BYTES * real / 4 * vertices * batch / self.copy_bandwidth
 
 
 def describe_device(device: torch.device) -> Device:
-    """The name, size and speed of a GPU; its bandwidth is measured."""
+    """Name, size and speed of a GPU; its bandwidth is measured."""
     facts = torch.cuda.get_device_properties(device)
     return Device(
         facts.name, facts.multi_processor_count, clock_of(facts, device), copy_bandwidth(device), facts.total_memory
@@ -52,7 +52,7 @@ def describe_device(device: torch.device) -> Device:
 
 
 def clock_of(facts: Any, device: torch.device) -> float:
-    """Highest clock of the multiprocessors in Hz: as torch knows it (in kHz), as nvidia-smi does, or the usual one."""
+    """Highest clock of the multiprocessors [Hz]: from torch (in kHz), from nvidia-smi, or the usual one."""
     kilohertz = getattr(facts, "clock_rate", 0)
     if kilohertz:
         return 1e3 * kilohertz
@@ -65,7 +65,7 @@ def clock_of(facts: Any, device: torch.device) -> float:
 
 
 def copy_bandwidth(device: torch.device, size: int = 1 << 30) -> float:
-    """Bytes read and written a second by a large copy."""
+    """Bytes read plus written per second by a large copy."""
     source = torch.zeros(size, dtype=torch.uint8, device=device)
     to = torch.empty_like(source)
     seconds = statistics.median(event_times(lambda: to.copy_(source), repetitions=10, seconds=0.0))
@@ -73,7 +73,7 @@ def copy_bandwidth(device: torch.device, size: int = 1 << 30) -> float:
 
 
 def event_times(work: Work, *, repetitions: int, seconds: float) -> list[float]:
-    """Seconds of at least so many runs, and until so much time has passed, each between two events."""
+    """Seconds of runs, each between two events: at least `repetitions` of them and for at least `seconds`."""
     for _ in range(2):
         work()
     times: list[float] = []
@@ -88,7 +88,7 @@ def event_times(work: Work, *, repetitions: int, seconds: float) -> list[float]:
 
 
 def recorded(work: Work, runs: int) -> torch.cuda.CUDAGraph:
-    """A graph with so many runs."""
+    """A graph of `runs` runs."""
     side = torch.cuda.Stream()
     side.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(side):
@@ -103,7 +103,7 @@ def recorded(work: Work, runs: int) -> torch.cuda.CUDAGraph:
 
 
 def graph_times(work: Work, *, repetitions: int, seconds: float) -> list[float]:
-    """Seconds of one run: a graph holds as many as take some milliseconds."""
+    """Seconds of one run; a graph holds enough runs to take some milliseconds."""
     once = min(event_times(work, repetitions=3, seconds=0.0))
     runs = max(1, min(50, round(3e-3 / max(once, 1e-6))))
     graph = recorded(work, runs)
@@ -111,7 +111,7 @@ def graph_times(work: Work, *, repetitions: int, seconds: float) -> list[float]:
 
 
 def host_seconds(work: Work, runs: int) -> float:
-    """Of the call alone: the device catches up afterwards."""
+    """Seconds of the call alone; the device catches up afterwards."""
     for _ in range(3):
         work()
     times = []
@@ -125,7 +125,7 @@ def host_seconds(work: Work, runs: int) -> float:
 
 
 def kernel_seconds(work: Work, runs: int) -> float | None:
-    """What the kernels of one run take by the profiler's account; None where it sees none."""
+    """Seconds of the kernels of one run according to the profiler; None if it sees none."""
     work()
     torch.cuda.synchronize()
     kinds = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]

@@ -1,10 +1,10 @@
-"""What a gradient costs beside the step that it goes through: milliseconds forward, and backward.
+"""Cost of a gradient beside its step: milliseconds forward and backward.
 
-A held bar swings, float32, time step 1/60 s; the loss is the sum of squares of the new positions, and the velocities
-before are asked for their gradients. Chebyshev takes 64 guarded iterations, 256 from 1e6 Pa on, and 16 times as many on
-the two large meshes of --large; Multilevel takes 16. Times are medians, as Python calls it, device awaited; on a GPU
-both ways in a CUDA graph besides. --adjoint multilevel adds rows of Chebyshev whose gradients have the preconditioner
-of Multilevel, on a GPU with kernel "stream"; --cells and --youngs choose other bars.
+A held bar swings, float32, time step 1/60 s. The loss is the sum of squares of the new positions, with gradients by the
+velocities before. Chebyshev takes 64 guarded iterations, 256 from 1e6 Pa on, and 16 times as many on the two large
+meshes of --large; Multilevel takes 16. Times are medians of Python calls with the device awaited; on a GPU forward plus
+backward are also timed in a CUDA graph. --adjoint multilevel adds rows of Chebyshev whose gradients use the
+preconditioner of Multilevel, on a GPU with kernel "stream". --cells and --youngs choose other bars.
 
     python benchmarks/gradients.py --threads 1
     python benchmarks/gradients.py --device cuda --threads 16 --large
@@ -39,7 +39,7 @@ TIMES = {"forward": "forward ms", "backward": "backward ms", "recorded": "both i
 
 
 def iterations_of(solver: str, cells: tuple[int, int, int], youngs: float) -> int:
-    """Of a step that leaves little of the way to its solution."""
+    """Iterations that solve a step to a small error."""
     if solver == "Multilevel":
         return 16
     return (64 if youngs < 1e6 else 256) * (16 if (cells, 1) in LARGE else 1)
@@ -54,7 +54,7 @@ def measure_scene(
     seconds: float,
     adjoint: str = "solver",
 ) -> Row:
-    """One row of the result."""
+    """Measure one row of the result."""
     scene = GpuScene("bar", cells, batch)
     sim = pd.Simulator(
         scene.build(), 1 / 60, iterations_of(solver, cells, youngs), solver=SOLVERS[solver](), progress=False,
@@ -89,7 +89,7 @@ def measure_scene(
 
 
 def line_of(row: Row) -> str:
-    """For a reader."""
+    """Format a row."""
     times = " | ".join(f"{row[name]:.3g}" for name in TIMES if row[name] is not None)
     share = row["backward"] / row["forward"]
     solver = row["solver"]
@@ -101,16 +101,16 @@ def line_of(row: Row) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=0.5, help="of timing a scene (%(default)g)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=0.5, help="duration of timing a scene (%(default)g)")
     parser.add_argument("--large", action="store_true", help="also 10 and 103 thousand vertices")
-    parser.add_argument("--cells", type=int, nargs=3, action="append", help="of one bar, in place of the usual ones")
+    parser.add_argument("--cells", type=int, nargs=3, action="append", help="cells of one bar, instead of the default")
     parser.add_argument("--youngs", type=float, nargs="+", default=YOUNGS, help="Pa (%(default)s)")
     parser.add_argument("--solver", choices=SOLVERS, nargs="+", default=list(SOLVERS), help="(%(default)s)")
     parser.add_argument(
         "--adjoint", choices=("solver", "multilevel"), nargs="+", default=["solver"], help="(%(default)s)"
     )
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     device = torch.device(options.device)

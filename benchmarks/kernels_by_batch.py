@@ -1,8 +1,8 @@
-"""Which kernel of a GPU is the quickest for how many environments, and whether "auto" takes it.
+"""The fastest GPU kernel for each number of environments, and whether "auto" chooses it.
 
-Bars that are held at one end and swing, 64 guarded iterations. A time is that of a CUDA graph of one step, so the start
-of the graph is in it; medians. Every kernel that fits is made for the batch, as "auto" makes it, and the times stand
-beside those that `torchpd.plan.kernel_costs` expects.
+Bars held at one end swing, with 64 guarded iterations. Times are medians of a CUDA graph of one step, including the
+start of the graph. Every kernel that fits is built for the batch, as "auto" builds it. Its times stand beside the
+estimates of `torchpd.plan.kernel_costs`.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ Row = dict[str, Any]
 MESHES = ((3, 3, 3), (15, 3, 3), (8, 5, 5), (15, 4, 4), (25, 5, 5), (19, 8, 8), (40, 8, 8), (39, 15, 15), (60, 24, 24))
 BATCHES = (1, 2, 4, 8, 16, 32, 64, 132, 264, 1024, 8192)
 IRREGULAR = ((3, 3, 3), (15, 4, 4), (9, 9, 9), (40, 8, 8), (39, 15, 15))  # in float32
-MOST_TETS = 8_000_000  # of all environments
+MOST_TETS = 8_000_000  # over all environments
 REPETITIONS = 5
 
 
 @cache
 def built(mesh: str, cells: tuple[int, int, int]) -> pd.Scene:
-    """Of one environment."""
+    """The scene of one environment."""
     return GpuScene("bars", cells, mesh=mesh).build()
 
 
 def measured(scene: GpuScene, dtype: torch.dtype) -> Row | None:
-    """Of one kernel: what it takes, what is expected, and its patches. None where it does not fit."""
+    """Measured and estimated time of one kernel, and its patches; None if it does not fit."""
     try:
         sim = pd.Simulator(
             built(scene.mesh, scene.cells), TIME_STEP, scene.iterations,
@@ -67,7 +67,7 @@ def measured(scene: GpuScene, dtype: torch.dtype) -> Row | None:
 
 
 def measure_batch(mesh: str, cells: tuple[int, int, int], batch: int, dtype: torch.dtype) -> Row:
-    """One row of the result: microseconds of an iteration by kernel, and the kernel that "auto" took."""
+    """One row of the result: microseconds per iteration by kernel, and the kernel chosen by "auto"."""
     scene = GpuScene("bars", cells, batch, mesh=mesh)
     sim = pd.Simulator(built(mesh, cells), TIME_STEP, 1, dtype=dtype, progress=False, batch=batch).to("cuda")
     made = {kernel: measured(replace(scene, kernel=kernel), dtype) for kernel in KERNELS}
@@ -87,7 +87,7 @@ def measure_batch(mesh: str, cells: tuple[int, int, int], batch: int, dtype: tor
 
 
 def line_of(row: Row) -> str:
-    """For a reader."""
+    """Format a row."""
     times = ", ".join(
         f"{kernel} ({own['patches']}) {own['microseconds']:.3g} ({own['expected']:.3g})"
         for kernel, own in row["kernels"].items()
@@ -101,12 +101,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--dtype", nargs="*", choices=("float32", "float64"), default=["float32"])
     parser.add_argument("--batches", nargs="*", type=int, default=BATCHES, help="environments")
-    parser.add_argument("--most-vertices", type=int, help="leaves out larger meshes")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
-    parser.add_argument("--keep", action="store_true", help="what --out has, and this run does not, stays")
+    parser.add_argument("--most-vertices", type=int, help="skip larger meshes")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
+    parser.add_argument("--keep", action="store_true", help="keep the rows of --out that this run does not measure")
     options = parser.parse_args()
     if options.keep and not options.out:
-        parser.error("--keep: is for the file that --out names")
+        parser.error("--keep: needs the file of --out")
     if not torch.cuda.is_available():
         parser.error("torch finds no CUDA device")
     meshes = [(name, "regular", cells) for name in options.dtype for cells in MESHES]
@@ -120,7 +120,7 @@ def main() -> None:
     ]
     with torch.no_grad():
         rows = [measure_batch(*job) for job in tqdm(jobs, desc="measuring", unit="batch", leave=False)]
-    print("microseconds of an iteration by kernel (patches), and what was expected")
+    print("microseconds of an iteration by kernel (patches), and the estimate")
     for row in rows:
         print(line_of(row))
     if options.out:
@@ -130,7 +130,7 @@ def main() -> None:
 
 
 def with_earlier(new: Row, earlier: Row) -> Row:
-    """With the rows of an earlier run that a new one does not have, in the order of that."""
+    """Add the rows of an earlier run that a new one lacks, in the earlier order."""
 
     def of(row: Row) -> tuple[Any, ...]:
         return row["dtype"], row["mesh"], row["vertices"], row["batch"]

@@ -1,13 +1,16 @@
-"""What does it take `Multilevel` where bodies land on smooth ground, and does `solver="auto"` reach its 1e-3 there?
+"""Iterations of `Multilevel` for bodies that land on frictionless ground, and the error of `solver="auto"` (aim 1e-3).
 
-Random meshes of 45 to 700 vertices, 2 cm to a metre long, 3e4 to 3e7 Pa, a third of them with a stiffness of each
-tetrahedron that varies a hundredfold: bars, balls and octopuses; boxes whose vertices are shaken, up to tetrahedra as
-flat as half a degree; points between tetrahedra of Delaunay, with slivers. What has those, or such a stiffness, counts
-as uneven. They hit smooth ground with a face, tilted or in any position, and six steps from there are judged in
-float64, of those with a converged step that is known to 1e-4 and further from the first iterate than float32 can tell.
-Soft bodies, which Chebyshev takes in less than 60 iterations, are left out. Iterations are counted on a grid of four an
-octave: the first that reach 1e-3 and still do so at the next number of the grid and at the last. Where none do,
-residual and energy tell whether they are on their way or in another minimum. Scenes that were measured are kept.
+Random meshes have 45 to 700 vertices, lengths of 2 cm to 1 m and 3e4 to 3e7 Pa; in a third of them the stiffness varies
+a hundredfold between tetrahedra. They are bars, balls and octopuses; boxes with perturbed vertices, down to tetrahedra
+of half a degree; and Delaunay meshes of random points, with slivers. Slivers or varying stiffness count as uneven.
+
+Bodies hit the ground with a face, tilted, or in any position. Six steps from there are judged in float64, if the
+converged step is known to 1e-4 and differs from the first iterate by more than float32 resolves. Soft bodies, for which
+Chebyshev takes less than 60 iterations, are left out.
+
+Iterations are counted on a grid of four per octave. The first number counts that reaches 1e-3 and still does so at the
+next number of the grid and at the last. If none does, residual and energy tell whether they converge or end in another
+minimum. Measured scenes are kept.
 """
 
 from __future__ import annotations
@@ -33,14 +36,14 @@ STEPS = 6
 SOFT = 60  # iterations of Chebyshev
 MOST = 700  # vertices
 COUNTS = sorted({round(2.0 ** (k / 4)) for k in range(45)})  # to 2048
-SURE = 1e-4  # of the error, that the converged step itself may have
-SOLVED = 1e-9  # residual of a step that more iterations change no more
+SURE = 1e-4  # largest uncertainty of the converged step, relative to the error
+SOLVED = 1e-9  # residual at which further iterations change nothing
 SEED = 99
 Row = dict[str, Any]
 
 
 def shaken_mesh(rng: np.random.Generator) -> tuple[str, pd.TetMesh]:
-    """A box whose vertices are moved by up to a third of a cell: with its tets, or with others between the points."""
+    """A box with vertices moved by up to a third of a cell; with its own tets, or new ones between the points."""
     cells = (int(rng.integers(4, 10)), *rng.integers(2, 5, 2).tolist())
     box = pd.shapes.box((1.0, 0.4, 0.4), cells)
     kept = bool(rng.random() < 0.5)
@@ -58,7 +61,7 @@ def shaken_mesh(rng: np.random.Generator) -> tuple[str, pd.TetMesh]:
 
 
 def random_landing(rng: np.random.Generator) -> tuple[Row, pd.Simulator, pd.State]:
-    """What was drawn, the simulator of it, and the state that the ground is met from."""
+    """The random parameters, the simulator, and the state before the impact."""
     kind, mesh = random_mesh(rng) if rng.random() < 0.5 else shaken_mesh(rng)
     size, youngs = 10.0 ** rng.uniform(-1.7, 0.0), 10.0 ** rng.uniform(4.5, 7.5)
     time_step = float(rng.choice([1 / 240, 1 / 60, 1 / 30], p=[0.2, 0.6, 0.2]))
@@ -110,7 +113,7 @@ def run_scene(number: int) -> Row:
 
 
 def needed(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> Row:
-    """The iterations that reach `AIM`, None where the last of `COUNTS` do not, and the errors of those."""
+    """The iterations that reach `AIM`, None if `COUNTS` are not enough, and the errors after the last."""
 
     def errors(count: int) -> Errors:
         sim.iterations = count
@@ -128,14 +131,14 @@ def needed(sim: pd.Simulator, state: pd.State, exact: ExactStep) -> Row:
 
 
 def place_of(step: Row) -> str:
-    """Where iterations end that reach no `AIM`."""
+    """Classify the result of iterations that do not reach `AIM`."""
     if step["residual"] > SOLVED:
         return "on their way"
     return "in a minimum of less energy" if step["energy"] < 0.0 else "in one of more energy"
 
 
 def summary(rows: list[Row]) -> Row:
-    """Of even and uneven bodies: what their hardest steps needed over the forecast, and what "auto" reached."""
+    """Iterations of the hardest steps over the estimate, and errors of "auto", for even and uneven bodies."""
     used = [row for row in rows if "left_out" not in row]
     out: Row = {"scenes": len(used), "left out": len(rows) - len(used)}
     for name in ("even", "uneven"):

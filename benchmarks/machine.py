@@ -1,4 +1,4 @@
-"""Times, the speed of the multiply-adds of this machine, and where numbers come from."""
+"""Timing, the multiply-add rate of this machine, and the provenance of results."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ PROVENANCE = ("command", "created", "commit")
 
 
 def multiply_adds_per_second() -> float:
-    """Float32 multiply-adds of one thread, by the loop of the extension: what the goals are scaled by."""
+    """Float32 multiply-adds per second of one thread, by the extension's loop; the goals are scaled by it."""
     return max(_C.multiply_adds_per_second() for _ in range(3))
 
 
 def measure(work: Callable[[], object], device: torch.device, *, repetitions: int, seconds: float) -> list[float]:
-    """Seconds of at least so many runs, and until so much time has passed. The first run is not counted."""
+    """Seconds of runs: at least `repetitions` of them and for at least `seconds`. The first run is not counted."""
     times: list[float] = []
     work()
     while len(times) < repetitions or sum(times) < seconds:
@@ -49,33 +49,33 @@ def wait_for(device: torch.device) -> None:
 
 
 def milliseconds(times: list[float]) -> Record:
-    """A summary of times."""
+    """Summary statistics of times [ms]."""
     return {"median": 1e3 * statistics.median(times), "min": 1e3 * min(times), "repetitions": len(times)}
 
 
 def cell(value: float | None, places: int, scale: float = 1.0) -> str:
-    """A number of a table."""
+    """Format a number of a table."""
     return "-" if value is None else f"{value * scale:,.{places}f}"
 
 
 def aligned(lines: list[list[str]]) -> str:
-    """A table: cells to the right of their columns."""
+    """Format a table with right-aligned columns."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(map(str.rjust, line, widths)) for line in lines)
 
 
 def write_result(path: Path, result: Record, merge: Callable[[Record, Record], Record] | None = None) -> None:
-    """A file anew or, with `merge`, made of the result and of what is there; others may write at the same time."""
+    """Write a result; `merge` combines it with the file's. Safe with concurrent writers."""
     if path.exists() and not path.is_file():  # a pipe or a terminal
         path.write_text(json.dumps(result, indent=1) + "\n")
         return
     path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
-    folder = os.open(path.parent, os.O_RDONLY)  # whose lock leaves no file behind
+    folder = os.open(path.parent, os.O_RDONLY)  # locking the folder leaves no lock file
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
         whole = merge(result, json.loads(path.read_text())) if merge and path.exists() else result
-        # a run that is killed leaves the file as it was
+        # replaced at once, so that a killed run leaves the old file
         part = path.with_name(f"{path.name}.part")
         part.write_text(json.dumps(whole, indent=1) + "\n")
         part.replace(path)
@@ -84,13 +84,13 @@ def write_result(path: Path, result: Record, merge: Callable[[Record, Record], R
 
 
 def run_of(result: Record) -> Record:
-    """What a row says of the run that measured it, for files that several runs have filled."""
+    """The provenance of a row, for files that combine several runs."""
     machine = ", ".join(str(result["machine"][name]) for name in ("cpu", "simd", "device"))
     return {**{name: result[name] for name in PROVENANCE}, "machine": machine, "torch": result["versions"]["torch"]}
 
 
 def earlier_rows(path: Path | None) -> list[Record]:
-    """The rows of a result, each with its run; none where there is no file."""
+    """The rows of a result file, each with its run; empty without a file."""
     if path is None or not path.exists():
         return []
     earlier = json.loads(path.read_text())
@@ -98,7 +98,7 @@ def earlier_rows(path: Path | None) -> list[Record]:
 
 
 def describe_run(device: torch.device, threads: int) -> Record:
-    """Everything that another run needs to be compared with this one."""
+    """Everything needed to compare this run with another."""
     command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
     return provenance.describe_run(command, device, threads)
 
@@ -110,10 +110,10 @@ def judge_scenes(
     run_scene: Callable[[int], Record],
     summary: Callable[[list[Record]], Record],
 ) -> None:
-    """The command of a benchmark of random scenes, on one thread: rows that its file has are kept."""
+    """Run a benchmark of random scenes from the command line, on one thread; rows in its file are kept."""
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=scenes, help="how many are drawn (%(default)s)")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--scenes", type=int, default=scenes, help="number of random scenes (%(default)s)")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args(words)
     torch.set_num_threads(1)
     now = describe_run(torch.device("cpu"), 1)

@@ -1,20 +1,20 @@
-"""What the multilevel solver needs: iterations to an error, set-up, memory and time, on boxes and on your own mesh.
+"""Benchmark of the multilevel solver: iterations to an error, set-up, memory and time, on boxes and on your own mesh.
 
-Boxes of 5r x r x r cells (1 x 0.2 x 0.2 m, six tetrahedra a cell), held at x = 0, thrown with v_y = -10 x^2, time step
-1/30 s, float64, start "inertial". Error |x - x*| / |x_0 - x*|; x* is the solver's own after 400 iterations, whose
-residual is printed. A mesh is held where it is low, thrown sideways, and has stiffness random over 1e4..1e6 Pa from tet
-to tet.
+Boxes have 5r x r x r cells (1 x 0.2 x 0.2 m, six tetrahedra per cell). They are held at x = 0 and thrown with
+v_y = -10 x^2; time step 1/30 s, float64, start "inertial". The error is |x - x*| / |x_0 - x*|. x* is the solver's
+result after 400 iterations, whose residual is printed. A mesh is held at its lowest part and thrown sideways; its
+stiffness is random per tetrahedron over 1e4..1e6 Pa.
 
-With --blocks the box is of 1e4 Pa and has pieces that are stiffer by a contrast: five slabs across it, or a grid of
-cubes. Rigid motions of the pieces (`RigidPieces`, rounds of four iterations) beside the solver alone; milliseconds are
-of the processor, one thread.
+With --blocks the box has 1e4 Pa and contains stiffer pieces: five slabs across it, or a grid of cubes. The benchmark
+compares rigid motions of the pieces (`RigidPieces`, rounds of four iterations) with the solver alone. Milliseconds are
+processor time of one thread.
 
     python benchmarks/multilevel.py --cells 11 26 --youngs 1e6 1e8
     python benchmarks/multilevel.py --mesh bunny.mesh
     python benchmarks/multilevel.py --blocks 12 16
     python benchmarks/multilevel.py --setup 32
 
-Several of these may be asked for at once, as for results/multilevel.json, which names its command.
+You may combine these, as results/multilevel.json does, which records its command.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def blocks(cells: int, kind: str, contrast: float) -> tuple[pd.Scene, pd.State]:
     """Slabs of 0.1 m, or cubes of a third to two thirds of that, every 0.2 or 0.1 m; 6, 8, 10 ... cells across."""
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (5 * cells, cells, cells))
     cell = np.floor(mesh.vertices[mesh.tets].mean(axis=1) * 5 * cells).astype(int)
-    each = cells // 2  # cells of a slab
+    each = cells // 2  # cells per slab
     slabs, inner = cell // each % 2 == 1, np.abs(cell % each - (each - 1) / 2) < 0.3 * each
     stiff = slabs[:, 0] if kind == "slabs" else inner.all(axis=1)
     solid = pd.Solid(mesh, youngs=np.where(stiff, 1e4 * contrast, 1e4), density=1000.0)
@@ -82,14 +82,14 @@ def loaded(path: str) -> tuple[pd.Scene, pd.State]:
 
 
 def moved(sim: pd.Simulator, state: pd.State, iterations: int) -> tuple[Tensor, pd.Info]:
-    """Displacement, from the velocity, which keeps more digits, and how it was found."""
+    """Displacement and info of a step; computed from the velocity, which keeps more digits."""
     sim.iterations = iterations
     after, info = sim(state, start="inertial", return_info=True)
     return after.velocities * sim.time_step, info
 
 
 def fewest(sim: pd.Simulator, state: pd.State, solution: Tensor, goals: list[float]) -> list[int]:
-    """Iterations after which the distance from the solution first is within each goal, as far as MOST reaches."""
+    """Fewest iterations within each goal of the distance from the solution, up to MOST."""
     found: list[int] = []
     for count in range(1, MOST + 1):
         distance = float((moved(sim, state, count)[0] - solution).norm())
@@ -129,7 +129,7 @@ def measure(name: str, scene: pd.Scene, state: pd.State) -> Row:
 
 
 def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> Row:
-    """Iterations and milliseconds to each error, with rigid motions and alone."""
+    """Iterations and milliseconds to each error, with rigid motions and without."""
     sim = pd.Simulator(scene, 1 / 30, ROUND, pd.Multilevel("lbfgs"), torch.float64, progress=False)
     start = time.process_time()
     pieces = pd.RigidPieces(sim)
@@ -175,7 +175,7 @@ def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> Row:
 
 
 def setup_of(cells: int) -> Row:
-    """Set-up, memory and time of an iteration in float32."""
+    """Set-up time, memory and time per iteration in float32."""
     scene, state = box(cells, 1e6)
     sim = pd.Simulator(scene, 1 / 30, 16, progress=False)
     start = time.perf_counter()
@@ -204,7 +204,7 @@ def setup_of(cells: int) -> Row:
 
 
 def measured(arguments: argparse.Namespace) -> Iterator[Row]:
-    """Everything that was asked for."""
+    """Yield all requested rows."""
     for path in arguments.mesh:
         yield measure(Path(path).name, *loaded(path))
     for cells in arguments.setup:
@@ -222,13 +222,13 @@ def measured(arguments: argparse.Namespace) -> Iterator[Row]:
 
 def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cells", type=int, nargs="+", help="r of the boxes: 11 where nothing else is asked for")
+    parser.add_argument("--cells", type=int, nargs="+", help="r of the boxes (11 if nothing else is requested)")
     parser.add_argument("--youngs", type=float, nargs="+", default=[1e6, 1e8], help="Young's moduli of the boxes [Pa]")
     parser.add_argument("--mesh", nargs="+", default=[], help="tetrahedral meshes")
     parser.add_argument("--setup", type=int, nargs="+", default=[], help="r of boxes to set up in float32")
-    parser.add_argument("--blocks", type=int, nargs="+", default=[], help="even r, from 6, of boxes with stiff pieces")
+    parser.add_argument("--blocks", type=int, nargs="+", default=[], help="even r >= 6 of boxes with stiff pieces")
     parser.add_argument("--contrasts", type=float, nargs="+", default=[1e2, 1e4, 1e6], help="of these pieces")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     arguments = parser.parse_args(words)
     run = describe_run(torch.device("cpu"), torch.get_num_threads())
     rows = list(measured(arguments))

@@ -1,12 +1,14 @@
-"""Free-form patches: heights, surface points and rays a second, beside what their arithmetic takes at the least; fits.
+"""Throughput of free-form patches: heights, surface points and rays per second beside lower bounds; and fits.
 
-A ball of 20 x 4^n patches with as many quadrics as vertices, float32. Floors on the CPU: the fewest additions and
-multiplications that the formulas need, at the rate at which all threads finish scalar ones (that of the extension's
-SIMD multiply-adds over the lanes), or the bytes read and written at the rate of a large copy, whichever is slower. For
-a ray: boxes down one path of the tree, and two places on the surface if it hits, one to correct and one to see that it
-is right. "search" is the op, "hits" adds points and normals, "picture" shades; "field" meets the published field, with
-a tree and with every patch tried for every ray. "fit" is `FreeFormPatches.fit` of a bumpy blob, which runs on the CPU
-on any device; "fit, one step" is `PatchLoss` over the same patches and its gradients for the quadrics, on the device.
+A ball has 20 x 4^n patches and as many quadrics as vertices, float32. A lower bound on the CPU is the larger of two
+times. The first is that of the fewest additions and multiplications in the formulas, at the scalar rate of all
+threads: the rate of the extension's SIMD multiply-adds over the lanes. The second is that of the bytes read and
+written, at the rate of a large copy. A ray counts the boxes on one path of the tree and, if it hits, two surface
+points: one to correct, one to verify.
+
+"search" is the op, "hits" adds points and normals, "picture" shades. "field" intersects the published field, with a
+tree and with every patch tried for every ray. "fit" is `FreeFormPatches.fit` of a bumpy blob, on the CPU for any
+device. "fit, one step" is `PatchLoss` over the same patches and its gradients by the quadrics, on the device.
 
     python benchmarks/patches.py --device cpu --out benchmarks/results/NAME.json
 """
@@ -23,7 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from compactness import BLOB_BOX, balls, blob
+from compactness import BLOB_BOX, blob, spheres
 from machine import describe_run, measure, multiply_adds_per_second, write_result
 
 import torchpd as pd
@@ -32,15 +34,15 @@ from torchpd.viewing.render import Camera
 
 LANES = {"avx512": 16, "avx2": 8}
 CAMERA = Camera((0.0, 0.0, 4.2), (0.0, 0.0, 0.0), 32.0)
-# additions and multiplications
+# numbers of additions and multiplications
 POINT, ENTRY, ACTIVE, SLOPES = 15, 18, 30, 16  # P; Q; R and its gradient where Q > 0; dh along the chart
 POSED = 3 * (15 + 3 + 3 * 5 + 3) + 15 + 2 * (3 * (6 + 15) + 15 + 6)  # sum_k b_k (v_k + A_k u_k), and two tangents
-SHEET = 15 + 3 * (7 + 8) + 2 * (3 + 16 + 3 * 8 + 12)  # the same with the frames multiplied out once a patch
+SHEET = 15 + 3 * (7 + 8) + 2 * (3 + 16 + 3 * 8 + 12)  # the same, with the frames multiplied out once per patch
 BOX = 12
 
 
 def ball(subdivisions: int, device: torch.device) -> pd.FreeFormPatches:
-    """Bumps over the vertices, about as wide as the patches."""
+    """A ball with bumps at the vertices, about as wide as the patches."""
     mesh = pd.TriMesh.from_trimesh(trimesh.creation.icosphere(subdivisions=subdivisions))
     rng = np.random.default_rng(0)
     count = len(mesh.vertices)
@@ -62,7 +64,7 @@ def places(patches: pd.FreeFormPatches, count: int) -> pd.PatchSamples:
 def floors(
     patches: pd.FreeFormPatches, where: pd.PatchSamples, cells: int, hits: float
 ) -> dict[str, tuple[float, float]]:
-    """Arithmetic and bytes of one height, surface point (with its height) and ray."""
+    """Arithmetic operations and bytes of one height, surface point (with its height) and ray."""
     entries = len(patches.lists[2]) / len(patches.triangles)
     rest = (where.barycentrics[:, :, None] * patches.vertices[patches.triangles.long()[where.patch.long()]]).sum(1)
     some = rest[:: max(1, len(rest) // 2000)]
@@ -123,7 +125,7 @@ def measure_fit(options: argparse.Namespace) -> list[dict[str, Any]]:
     device = torch.device(options.device)
     patches, quadrics = options.fit
     begin = time.perf_counter()
-    fit = pd.FreeFormPatches.fit(blob, quadrics, patches=balls(patches), bounds=BLOB_BOX)
+    fit = pd.FreeFormPatches.fit(blob, quadrics, patches=spheres(patches), bounds=BLOB_BOX)
     seconds = time.perf_counter() - begin
     fitted = fit.patches.to(device)
     loss = pd.PatchLoss(fitted, blob, bounds=BLOB_BOX)
@@ -150,7 +152,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=["cpu", "cuda"], default="cpu")
     parser.add_argument(
-        "--subdivisions", type=int, nargs="+", default=[1, 4], help="of the icosahedron: 20 x 4^n patches"
+        "--subdivisions", type=int, nargs="+", default=[1, 4], help="subdivisions of the icosahedron: 20 x 4^n patches"
     )
     parser.add_argument(
         "--fit",
@@ -158,13 +160,13 @@ def main() -> None:
         nargs=2,
         default=(20, 20),
         metavar=("PATCHES", "QUADRICS"),
-        help="of the blob, 20 x 4^n patches",
+        help="subdivisions of the blob, 20 x 4^n patches",
     )
-    parser.add_argument("--samples", type=int, default=1_000_000, help="places for heights and surface points")
-    parser.add_argument("--pixels", type=int, default=1024, help="along the side of the picture")
+    parser.add_argument("--samples", type=int, default=1_000_000, help="sample points for heights and surface points")
+    parser.add_argument("--pixels", type=int, default=1024, help="pixels per side of the picture")
     parser.add_argument("--repetitions", type=int, default=3)
-    parser.add_argument("--seconds", type=float, default=0.5, help="of every measurement at least")
-    parser.add_argument("--out", type=Path, help="file for the results (JSON)")
+    parser.add_argument("--seconds", type=float, default=0.5, help="least duration of every measurement")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args()
     rows = [row for n in options.subdivisions for row in measure_patches(n, options)] + measure_fit(options)
     if options.out:

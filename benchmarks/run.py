@@ -1,4 +1,4 @@
-"""Measure the speed of a step: `python benchmarks/run.py --help`. README.md beside it says how to read the result."""
+"""Measure the speed of a step: `python benchmarks/run.py --help`. benchmarks/README.md explains the result."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from vectorised import VectorisedStep
 import torchpd as pd
 
 SCHEMA = 1
-TORCH_WORK = 2_000_000  # tet-iterations with which a step in plain torch is measured well enough
+TORCH_WORK = 2_000_000  # tet-iterations that suffice to time a step in plain torch
 
 Row = dict[str, Any]
 
 
 def workspace_bytes(sim: pd.Simulator, batch: int) -> int:
-    """Memory of one environment while it steps on the CPU, as csrc/cpu/step/workspace.h lays it out (no forces)."""
+    """CPU memory of one environment during a step, as csrc/cpu/step/workspace.h lays it out (without forces)."""
     plan = sim.plan
     slots = len(plan.slot_vertex)
-    # five vectors and two weights a vertex, two vectors a slot; alone, a vector takes four numbers
+    # five vectors and two weights per vertex, two vectors per slot; a single environment stores vectors as four numbers
     numbers = 22 * plan.vertices + 8 * slots if batch < 8 else 17 * plan.vertices + 6 * slots
     return (numbers + plan.tet_volume.numel()) * torch.finfo(sim.dtype).bits // 8
 
 
 def compile_scene(scene: BenchScene, dtype: torch.dtype, device: str) -> tuple[pd.Simulator, Row]:
-    """The simulator, and what compiling it took."""
+    """The simulator and its compile time."""
     parts = scene.build()
     values = parts.values()
     begin = time.perf_counter()
@@ -59,7 +59,7 @@ def compile_scene(scene: BenchScene, dtype: torch.dtype, device: str) -> tuple[p
 
 
 def compare_with_goal(scene: BenchScene, dtype: str, rate: float, multiply_adds: float, threads: int) -> Row | None:
-    """The goals for this processor, and the share of the lower one that was reached."""
+    """The goals for this processor, and the fraction reached of the lower one."""
     if dtype not in scene.goals:
         return None
     goal = scene.goals[dtype]
@@ -89,7 +89,7 @@ def measure_torch(sim: pd.Simulator, scene: BenchScene, tets: int, options: argp
 
 
 def measure_scene(scene: BenchScene, dtype: torch.dtype, options: argparse.Namespace) -> Row:
-    """One row of the result. Rates come from the fastest run, the one that was disturbed least."""
+    """Measure one row of the result. Rates come from the fastest run, which was disturbed least."""
     sim, facts = compile_scene(scene, dtype, options.device)
     state = scene.start(sim)
     before = multiply_adds_per_second()
@@ -124,7 +124,7 @@ def measure_scene(scene: BenchScene, dtype: torch.dtype, options: argparse.Names
 
 
 def measure_calls(options: argparse.Namespace) -> Row:
-    """What a call costs beside the work: microseconds of one iteration on one tetrahedron."""
+    """Microseconds of a call with one iteration on one tetrahedron: the overhead beside the work."""
     scene = pd.Scene(pd.Solid(pd.shapes.single_tet(), youngs=1e4))
     sim = pd.Simulator(scene, TIME_STEP, iterations=1).to(options.device)
     state = sim.rest_state()
@@ -142,7 +142,7 @@ def measure_calls(options: argparse.Namespace) -> Row:
 
 
 def table(rows: list[Row]) -> str:
-    """The rows for a reader."""
+    """Format the rows as a table."""
     head = ["scene", "dtype", "tets", "batch", "K", "ms median", "ms min", "M tet-it/s", "goal here", "of goal"]
     lines = [[*head, "FMA/tet-it", "x torch", "plan s", "B/vertex"]]
     for row in rows:
@@ -169,7 +169,7 @@ def table(rows: list[Row]) -> str:
 
 
 def parse(words: list[str]) -> argparse.Namespace:
-    """Options of the command line, and what follows from them."""
+    """Command-line options, and values derived from them."""
     parser = argparse.ArgumentParser(description="Measure the speed of a step.")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda where the extension has it")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")
@@ -177,14 +177,14 @@ def parse(words: list[str]) -> argparse.Namespace:
         "--only",
         nargs="+",
         metavar="NAME",
-        help=f"of {', '.join(scene.name for scene in SCENES)}; a wrong one lists a GPU's",
+        help=f"scenes among {', '.join(scene.name for scene in SCENES)}; an unknown one lists those of a GPU",
     )
-    parser.add_argument("--dtype", nargs="+", choices=["float32", "float64"], help="both, or float32 on a GPU")
-    parser.add_argument("--no-torch", dest="torch", action="store_false", help="leave out the step in plain torch")
-    parser.add_argument("--quick", action="store_true", help="tiny scenes, to see that everything runs")
+    parser.add_argument("--dtype", nargs="+", choices=["float32", "float64"], help="default: both; on a GPU float32")
+    parser.add_argument("--no-torch", dest="torch", action="store_false", help="skip the step in plain torch")
+    parser.add_argument("--quick", action="store_true", help="tiny scenes, only to check that everything runs")
     parser.add_argument("--heavy", action="store_true", help="on a GPU also the scenes that take minutes to prepare")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
-    parser.add_argument("--keep", action="store_true", help="on a GPU: what --out has, and this run does not, stays")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
+    parser.add_argument("--keep", action="store_true", help="GPU: keep the rows of --out not measured by this run")
     options = parser.parse_args(words)
     options.repetitions, options.seconds = (2, 0.0) if options.quick else (7, 1.0)
     options.on_gpu = torch.device(options.device).type == "cuda"
@@ -197,16 +197,16 @@ def parse(words: list[str]) -> argparse.Namespace:
     names = [scene.name for scene in scenes] + ["calls", "paper"] * options.on_gpu
     unknown = set(options.only or ()) - set(names)
     if unknown:
-        parser.error(f"--only: no scene {', '.join(sorted(unknown))}; there are {', '.join(names)}")
+        parser.error(f"--only: must be among {', '.join(names)}, got {', '.join(sorted(unknown))}")
     if options.keep and not (options.on_gpu and options.out):
-        parser.error("--keep: is for a GPU, and for the file that --out names")
+        parser.error("--keep: needs a GPU and the file of --out")
     wanted = options.only or [s.name for s in scenes if options.heavy or not getattr(s, "heavy", False)]
     options.scenes = [scene for scene in scenes if scene.name in wanted]
     return options
 
 
 def run_on_cpu(options: argparse.Namespace, result: Row, keep: Callable[[], None]) -> None:
-    """Everything, into the result and printed."""
+    """Measure everything; store it in the result and print it."""
     result["goals_hold_at"] = {
         "multiply_adds_per_second_per_thread": GOAL_MULTIPLY_ADDS_PER_SECOND,
         "threads": GOAL_THREADS,
@@ -229,7 +229,7 @@ def main(words: list[str]) -> None:
     result = {"schema": SCHEMA, **describe_run(torch.device(options.device), options.threads)}
 
     def keep() -> None:
-        """Writes what there is so far: a run that is cut short has not been for nothing."""
+        """Write the results so far, so that an interrupted run keeps them."""
         if options.out:
             write_result(options.out, result, with_earlier if options.keep else None)
 

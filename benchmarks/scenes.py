@@ -1,4 +1,4 @@
-"""What is measured: scenes as data, with the goals that they are held against."""
+"""CPU benchmark scenes as data, with their goals."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ TIME_STEP = 1 / 60  # s
 YOUNGS = 1e5  # Pa
 DENSITY = 1000.0  # kg/m^3
 
-# The goals are for two threads of an AVX-512 core that does 78 G float32 multiply-adds a second (4.9 G instructions of
-# 16 lanes). A run scales them by what the same loop reaches in its own process.
+# The goals are for two threads of an AVX-512 core with 78 G float32 multiply-adds per second (4.9 G instructions of 16
+# lanes). A run scales them by the rate of the same loop in its own process.
 GOAL_THREADS = 2
-GOAL_MULTIPLY_ADDS_PER_SECOND = 78e9  # a thread
+GOAL_MULTIPLY_ADDS_PER_SECOND = 78e9  # per thread
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Tet-iterations per second."""
+    """Goals in tet-iterations per second."""
 
     least: float
     aim: float
@@ -65,7 +65,7 @@ SCENES = (
     BenchScene("batch-256", (13, 3, 3), batch=256, goals=_goals((280, 450), (170, 220))),
 )
 
-# seconds in all, to see that everything runs: the numbers mean nothing
+# takes seconds in all, only to check that everything runs: the numbers mean nothing
 QUICK_SCENES = (
     BenchScene("tiny", (4, 1, 1), iterations=4, goals=_goals((1, 2), (1, 2))),
     BenchScene("tiny-batch", (4, 1, 1), batch=9, iterations=4),

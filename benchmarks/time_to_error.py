@@ -1,13 +1,13 @@
-"""Time of a step to an error of 1e-3: Multilevel against guarded Chebyshev on the same device, and what "auto" chose.
+"""Time of a step to an error of 1e-3: Multilevel against guarded Chebyshev on one device, and the choice of "auto".
 
 The beam of `python -m torchpd study beam`: 1 x 0.2 x 0.2 m, held at x = 0, thrown downwards with v_y = -10 x^2, time
-step 1/30 s, float32, start "velocity". Error |x - x*| / |x_0 - x*|, x* the converged step in float64: Multilevel on the
-CPU until its residual stops falling; rows have the bound that the residual leaves. Iterations are found by doubling and
-bisection to a sixteenth, up to a limit that the rows name; what does not reach the error stays in the table.
+step 1/30 s, float32, start "velocity". The error is |x - x*| / |x_0 - x*|. x* is the converged step in float64 by
+Multilevel on the CPU, run until its residual stops falling; rows contain the error bound from that residual. Iterations
+are found by doubling and bisection to a sixteenth, up to a limit named in each row. Failures stay in the table.
 
-Times are of steps in turns, the lowest and the median: with one thread on a CPU those of the processor, on a GPU those
-of the step as Python calls it, device awaited. With --batch as many equal environments take the step together. Cases
-that were measured are kept, with the run that measured them: a run that was stopped goes on.
+Times are the lowest and the median of steps in turns. With one CPU thread they are processor time; on a GPU they are
+Python calls with the device awaited. With --batch that many equal environments take the step together. Measured cases
+are kept, with their run: an interrupted run resumes.
 
     python benchmarks/time_to_error.py --device cpu
     python benchmarks/time_to_error.py --device cuda --threads 16
@@ -38,18 +38,18 @@ from torchpd.study.bench import clock_of
 from torchpd.study.scenes import STUDY_SCENES
 
 SIZES = {"256": 3, "1k": 5, "3k": 8, "10k": 12, "30k": 18, "100k": 26}  # cells across
-ALONE = [size for size in SIZES if size != "256"]  # unless asked for: smaller ones come in batches
+ALONE = [size for size in SIZES if size != "256"]  # default; the smallest is measured in batches
 YOUNGS = (1e4, 1e5, 1e6, 1e7, 1e8)  # Pa
-MOST = {**dict.fromkeys(SIZES, 8192), "100k": 4096}  # iterations; up to thirty seconds of a step
+MOST = {**dict.fromkeys(SIZES, 8192), "100k": 4096}  # iterations; up to thirty seconds per step
 ERROR = 1e-3
 SOLVERS: dict[str, Solver] = {"Chebyshev": pd.Chebyshev(), "Multilevel": pd.Multilevel()}
-REFERENCE_ITERATIONS = 100  # between two looks at the residual
+REFERENCE_ITERATIONS = 100  # between two checks of the residual
 Row = dict[str, Any]
 Rows = dict[tuple[str, float, int], Row]  # by size, Young's modulus and batch
 
 
 class Case:
-    """One beam on one device, its converged step, and the error of any answer."""
+    """One beam on one device, its converged step, and the error of any result."""
 
     def __init__(
         self, cells: int, youngs: float, device: torch.device, dtype: torch.dtype = torch.float32, batch: int = 1
@@ -78,7 +78,7 @@ class Case:
 
 @torch.no_grad()
 def converged(sim: pd.Simulator, state: pd.State) -> tuple[torch.Tensor, float]:
-    """u* [V, 3] m in float64, and |grad E| / min m/h^2 / |u_0 - u*|: bounds its error where elements are stable."""
+    """u* [V, 3] m in float64, and |grad E| / min m/h^2 / |u_0 - u*|, which bounds its error for stable elements."""
     sim.iterations, guess = REFERENCE_ITERATIONS, "velocity"
     best, lowest = state.velocities, np.inf
     for _ in range(20):
@@ -95,7 +95,7 @@ def converged(sim: pd.Simulator, state: pd.State) -> tuple[torch.Tensor, float]:
 
 
 def fewest(case: Case, solver: Solver, most: int) -> tuple[int | None, float]:
-    """Iterations to `ERROR` and the error there; None and the error of `most` when these are not enough."""
+    """Iterations to `ERROR` and the error there; None and the error after `most` if they are not enough."""
     high, reached = 8, case.error(solver, 8)
     while reached > ERROR:
         if high >= most:
@@ -112,7 +112,7 @@ def fewest(case: Case, solver: Solver, most: int) -> tuple[int | None, float]:
 
 @torch.no_grad()
 def milliseconds(case: Case, solvers: dict[str, tuple[Solver, int]], seconds: float) -> Row:
-    """A step of each, in turns, so that all see the same machine."""
+    """Time a step of each solver in turns, under equal load of the machine."""
     clock, device = clock_of(case.sim.device), case.sim.device
     times: dict[str, list[float]] = {name: [] for name in solvers}
     sims = {}
@@ -136,7 +136,7 @@ def milliseconds(case: Case, solvers: dict[str, tuple[Solver, int]], seconds: fl
 def run_case(
     size: str, youngs: float, device: torch.device, seconds: float, dtype: torch.dtype = torch.float32, batch: int = 1
 ) -> Row:
-    """Iterations, errors and times of both solvers and of what "auto" chose."""
+    """Iterations, errors and times of both solvers and of the choice of "auto"."""
     case, most = Case(SIZES[size], youngs, device, dtype, batch), MOST[size]
     sim = case.sim
     row: Row = {
@@ -165,7 +165,7 @@ def run_case(
 
 @torch.no_grad()
 def run_auto(case: Case, seconds: float) -> Row:
-    """What "auto" chose for this batch, its error and time."""
+    """The choice of "auto" for this batch, its error and time."""
     sim = case.sim
     sim.solver = "auto"
     assert sim.choice is not None
@@ -177,7 +177,7 @@ def run_auto(case: Case, seconds: float) -> Row:
 
 
 def judged(row: Row) -> Row:
-    """How many times faster Multilevel is, a bound where Chebyshev failed; and whether auto took the faster one."""
+    """Add the speed-up of Multilevel (a bound if Chebyshev failed), and whether auto chose the faster one."""
     plain, levels = (row["solvers"][name] for name in SOLVERS)
     ratio = plain["milliseconds"]["min"] / levels["milliseconds"]["min"]
     reached = [own["iterations"] is not None for own in (plain, levels)]
@@ -187,13 +187,13 @@ def judged(row: Row) -> Row:
         "at_least": not reached[0],
         "faster": faster,
         "auto_took_the_faster": row["auto"]["solver"] == faster,
-        # what a wrong choice costs; near 1 both do
+        # cost of a wrong choice; near 1 both are as good
         "auto_loses": max(ratio, 1.0 / ratio) if all(reached) and row["auto"]["solver"] != faster else 1.0,
     }
 
 
 def table(rows: list[Row]) -> str:
-    """All numbers, a row for each body."""
+    """Table of all numbers, one row per body."""
     lines = [
         '| vertices | Young\'s modulus | guarded Chebyshev | `Multilevel` | times faster | `solver="auto"` |',
         "|---|---|---|---|---|---|",
@@ -222,7 +222,7 @@ def table(rows: list[Row]) -> str:
 
 
 def matrix(rows: list[Row]) -> str:
-    """Short, for docs/accuracy.md: milliseconds of Chebyshev / Multilevel and their ratio, by size and stiffness."""
+    """Table of docs/accuracy.md: milliseconds of Chebyshev / Multilevel and their ratio, by size and stiffness."""
     stiffnesses = sorted({row["youngs"] for row in rows})
     lines = [
         "| vertices | " + " | ".join(f"{youngs:.0e} Pa" for youngs in stiffnesses) + " |",
@@ -245,21 +245,21 @@ def _short(row: Row) -> str:
 
 
 def _plain(number: float, *, down: bool = False) -> str:
-    """Two digits, without an exponent; what is a bound from below is not rounded up."""
+    """Format two digits without an exponent; a lower bound is rounded down."""
     unit = 0.1 if number < 10.0 else 10.0 ** (math.floor(math.log10(number)) - 1)
     digits = math.floor(number / unit + 1e-9) if down else round(number / unit)
     return f"{digits * unit:,.1f}" if number < 10.0 else f"{digits * unit:,.0f}"
 
 
 def cost_in_use(name: str, row: Row) -> Cost | None:
-    """What `solver_choice` holds for a solver; None for Chebyshev on a GPU: see `kernels_by_batch.py`."""
+    """The cost of a solver in `estimate.solver_choice`; None for Chebyshev on a GPU: see `kernels_by_batch.py`."""
     if name == "Multilevel":
         return multilevel_cost(row["vertices"], on_gpu=row["kernel"] is not None)
     return CPU_CHEBYSHEV if row["kernel"] is None else None
 
 
 def costs_of_batches(rows: list[Row]) -> str:
-    """What `solver_choice` holds of environments beside the first, for which its own number is taken."""
+    """Costs in `torchpd.estimate.solver_choice` of the environments after the first, which has its own cost."""
     lines = []
     for row in rows:
         vertices, batch = row["vertices"], row["batch"]
@@ -276,7 +276,7 @@ def costs_of_batches(rows: list[Row]) -> str:
 
 
 def costs(rows: list[Row]) -> str:
-    """Microseconds of an iteration by kernel and size: what `torchpd.estimate.solver_choice` holds."""
+    """Microseconds per iteration by kernel and size: the cost model in `torchpd.estimate.solver_choice`."""
     lines = []
     for kernel in sorted({row["kernel"] or "cpu" for row in rows}):
         for name in SOLVERS:
@@ -285,7 +285,7 @@ def costs(rows: list[Row]) -> str:
             times = np.array([row["solvers"][name]["microseconds_an_iteration"] for row in own])
             if len(set(sizes)) < 2:
                 continue
-            # relative errors count: the table serves every size
+            # minimises relative errors, since the table serves every size
             design = np.stack([1.0 / times, sizes / times], axis=1)
             latency, each = np.linalg.lstsq(design, np.ones(len(own)), rcond=None)[0]
             cost = cost_in_use(name, own[0])
@@ -305,14 +305,14 @@ def main(words: list[str]) -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--sizes", nargs="*", choices=SIZES, default=ALONE, help="of the beam")
     parser.add_argument("--youngs", nargs="*", type=float, default=list(YOUNGS), help="Young's moduli [Pa]")
-    parser.add_argument("--seconds", type=float, default=2.0, help="of timing a case (%(default)g)")
-    parser.add_argument("--batch", type=_positive, default=1, help="environments of a step (%(default)s)")
-    parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=2.0, help="duration of timing a case (%(default)g)")
+    parser.add_argument("--batch", type=_positive, default=1, help="environments per step (%(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (%(default)s)")
     parser.add_argument(
-        "--dtype", choices=("float32", "float64"), default="float32", help="of the steps that are timed"
+        "--dtype", choices=("float32", "float64"), default="float32", help="precision of the timed steps"
     )
-    parser.add_argument("--auto", action="store_true", help='measure anew what "auto" takes in cases that are kept')
-    parser.add_argument("--out", type=Path, help="file for the result (JSON); by default that of the device")
+    parser.add_argument("--auto", action="store_true", help='measure the choice of "auto" again in kept cases')
+    parser.add_argument("--out", type=Path, help="output file (JSON); default: that of the device")
     options = parser.parse_args(words)
     float64, batch = ["float64"] * (options.dtype == "float64"), [f"batch-{options.batch}"] * (options.batch > 1)
     name = "-".join(["time-to-error", options.device, *float64, *batch])
@@ -344,7 +344,7 @@ def main(words: list[str]) -> None:
 
 
 def in_order(rows: Rows) -> list[Row]:
-    """By batch, size and stiffness."""
+    """Sort the rows by batch, size and stiffness."""
     return [rows[key] for key in sorted(rows, key=lambda key: (key[2], SIZES[key[0]], key[1]))]
 
 

@@ -1,10 +1,10 @@
-"""Do the rigid motions after the iterations leave alone what those have solved?
+"""Check that the rigid motions after the iterations do not move a solved step.
 
-Boxes of 5 to 40 cm and 3e4 to 1e7 Pa, on a face, an edge or in any position, fall, slide and tumble on ground with
-friction of 0 to 2 (float64). Eight steps of each are solved by 3000 iterations, of `Multilevel()` with friction of 0.3
-and less and of `Chebyshev(rho=0.99)` with more. Where one keeps more than 1e-5 of its residual, iterations of the
-oracle without rigid motions go on from there, and then rigid motions have their turn. What the iterations solve and a
-rigid motion takes elsewhere is counted, and what the iterations leave unsolved.
+Boxes of 5 to 40 cm and 3e4 to 1e7 Pa fall, slide and tumble on ground with friction of 0 to 2 (float64). They start on
+a face, an edge or in any position. Eight steps of each are solved by 3000 iterations: `Multilevel()` up to friction
+0.3, else `Chebyshev(rho=0.99)`. If one keeps more than 1e-5 of its residual, the reference iterates on without rigid
+motions, and rigid motions follow. The benchmark counts the solved steps that a rigid motion moves, and the unsolved
+ones.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from torchpd.reference import StepProblem, step_problem
 from torchpd.reference.solvers import guarded_chebyshev
 
 STEPS = 8
-LEFT = 1e-5  # of the residual: a step that is looked at
-SOLVED = 1e-8  # by the iterations alone
+LEFT = 1e-5  # remaining fraction of the residual above which a step is examined
+SOLVED = 1e-8  # fraction at which iterations alone have solved it
 MOVED = 1e-9  # m: more than rounding
 SEED = 11
 Row = dict[str, Any]
 
 
 class Still(StepProblem):
-    """Without rigid motions."""
+    """A step without rigid motions."""
 
     def align(self, displacement: NDArray[np.float64], *, first: bool = False) -> NDArray[np.float64]:
         return displacement
 
 
 def random_tumble(rng: np.random.Generator) -> tuple[Row, pd.Simulator, pd.State]:
-    """What was drawn, the simulator of it, and the state that the ground is met from."""
+    """The random parameters, the simulator, and the state before the impact."""
     size = rng.uniform(0.05, 0.4, 3)
     mesh = pd.shapes.box(tuple(size), tuple(rng.integers(1, 4, 3).tolist()))
     position = ("any", "edge", "face")[rng.integers(3)]
@@ -80,7 +80,7 @@ def residual_of(problem: StepProblem, u: NDArray[np.float64]) -> float:
 
 
 def judge(problem: StepProblem, u: NDArray[np.float64]) -> Row:
-    """What iterations alone leave of the residual, and how far a rigid motion goes from there [m]."""
+    """Remaining fraction of the residual after iterations alone, and displacement by the rigid motion after it [m]."""
     still = Still(**{field.name: getattr(problem, field.name) for field in fields(problem)})
     solved = guarded_chebyshev(still, u, iterations=1500).displacement
     return {
@@ -90,7 +90,7 @@ def judge(problem: StepProblem, u: NDArray[np.float64]) -> Row:
 
 
 def summary(rows: list[Row]) -> Row:
-    """Of all steps those that iterations leave unsolved, and what rigid motions take elsewhere, by friction."""
+    """Count the unsolved steps, and the solved ones that rigid motions move, by friction."""
     left = [(row["friction"], step) for row in rows for step in row["left"]]
     solved = [(friction, step["moved"]) for friction, step in left if step["residual of iterations"] <= SOLVED]
     moved = [(friction, way) for friction, way in solved if way > MOVED]

@@ -1,9 +1,9 @@
-"""Does `Simulator.tune` keep its promises? On random scenes that it has never seen, and from other motions of each.
+"""Check the error bounds of `Simulator.tune` on random scenes and on other motions of each.
 
-A scene is a random mesh (bar, slivers, ball, octopus), stiffness (1e3 to 1e8 Pa) and time step (1e-3 to 1/30 s), held
-at one end, free, or falling on the ground. It is tuned from one random motion and judged on steps of another one,
-against the converged step in float64. Promises that the target was attained and honest refusals ("the best is ...")
-are counted apart. Scenes that were judged are kept in the file of results: a run that was stopped goes on.
+A scene has a random mesh (bar, slivers, ball, octopus), stiffness (1e3 to 1e8 Pa) and time step (1e-3 to 1/30 s). It is
+held at one end, free, or falling on the ground. It is tuned from one random motion and judged on steps of another,
+against the converged step in float64. Results that attain the target and refusals ("the best is ...") are counted
+separately. Judged scenes stay in the results file: an interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from torchpd.accuracy.tuning import TuningWarning
 from torchpd.estimate.convergence import has_friction
 
 JUDGED_STEPS = (1, 5, 20, 45)  # of the other motion
-SLACK = 1.2  # of a budget in milliseconds
-STEADY = 0.1  # change of the machine's speed while a budget is tuned for
+SLACK = 1.2  # allowed time over a budget in milliseconds
+STEADY = 0.1  # allowed change of the machine's speed during the tuning for a budget
 ATTEMPTS = 6
 Row = dict[str, Any]
 
 
 def random_mesh(rng: np.random.Generator) -> tuple[str, pd.TetMesh]:
-    """60 to 900 vertices, about a metre long."""
+    """A random mesh of 60 to 900 vertices, about a metre long."""
     kind = str(rng.choice(["bar", "slivers", "ball", "octopus"]))
     cells = rng.integers(2, 5, 2)
     if kind == "bar":
@@ -48,7 +48,7 @@ def random_mesh(rng: np.random.Generator) -> tuple[str, pd.TetMesh]:
         tets = Delaunay(points).simplices
         volumes = np.linalg.det(points[tets][:, 1:] - points[tets][:, :1])
         turned = np.where(volumes[:, None] < 0.0, tets[:, [0, 2, 1, 3]], tets)
-        # as flat as a thousandth of a regular share
+        # down to a thousandth of the volume of a regular tetrahedron
         return kind, pd.TetMesh(points, turned[np.abs(volumes) > 1e-3 * np.median(np.abs(volumes))])
     import trimesh
 
@@ -60,7 +60,7 @@ def random_mesh(rng: np.random.Generator) -> tuple[str, pd.TetMesh]:
 
 
 def random_scene(rng: np.random.Generator) -> tuple[Row, pd.Simulator]:
-    """What was drawn, and the simulator of it."""
+    """The random parameters and the simulator."""
     kind, mesh = random_mesh(rng)
     youngs = 10.0 ** rng.uniform(3.0, 8.0)
     time_step = 10.0 ** rng.uniform(-3.0, np.log10(1.0 / 30.0))
@@ -78,7 +78,7 @@ def random_scene(rng: np.random.Generator) -> tuple[Row, pd.Simulator]:
 
 
 def random_state(sim: pd.Simulator, rng: np.random.Generator) -> pd.State:
-    """At rest in shape, with velocities that are a random quadratic of the place, up to some 3 m/s."""
+    """The rest shape with velocities that are a random quadratic of the position, up to about 3 m/s."""
     state = sim.rest_state()
     x = state.positions[0].double()
     x = (x - x.mean(0)) / (x.max() - x.min())
@@ -93,7 +93,7 @@ def random_state(sim: pd.Simulator, rng: np.random.Generator) -> pd.State:
 
 @torch.no_grad()
 def judge(sim: pd.Simulator, state: pd.State) -> Row:
-    """Errors of steps along the motion of the tuned simulator, and what the tuning result says of each."""
+    """Errors of steps along the motion of the tuned simulator, beside the bounds of its tuning result."""
     solved = settled_steps if has_friction(sim.compiled) else exact_steps
     errors, raw, trusted, audits, residuals = [], [], [], [], []
     for step in range(max(JUDGED_STEPS) + 1):
@@ -114,7 +114,7 @@ def judge(sim: pd.Simulator, state: pd.State) -> Row:
 
 
 def draw_scene(number: int, dtype: torch.dtype) -> tuple[Row, pd.Simulator, pd.State, pd.State]:
-    """The scene of a number, the motion that it is tuned from and that it is judged on."""
+    """The scene of a number, the motion to tune from, and the motion to judge."""
     rng = np.random.default_rng([2024, number])
     facts, drawn = random_scene(rng)
     sim = drawn.to(dtype)
@@ -141,7 +141,7 @@ def run_scene(number: int, error: float, dtype: torch.dtype) -> Row:
 
 
 def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
-    """A budget of 1.5 times what 40 iterations of the default take, and the share of it that the choice needs."""
+    """Tune for a budget of 1.5 times the time of 40 default iterations; measures the fraction that the choice needs."""
     ruler = copy.copy(sim)
     ruler.solver, ruler.iterations, ruler.tolerance = pd.Chebyshev(), 40, 0.0
 
@@ -155,7 +155,7 @@ def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", TuningWarning)
             result = sim.tune(start, milliseconds=1.5 * speed)
-        # on a shared machine the speed may change meanwhile, which says nothing about the choice
+        # the speed of a shared machine may change meanwhile: such rows are counted apart
         steady = abs(min(median(ruler) for _ in range(5)) / speed - 1.0) < STEADY
     ratio = float(np.median([median(sim) / (1.5 * median(ruler)) for _ in range(7)]))
     return {
@@ -165,8 +165,8 @@ def judge_budget(sim: pd.Simulator, start: pd.State, other: pd.State) -> Row:
 
 
 def suspects(row: Row) -> list[bool]:
-    """Whether `TuningResult.estimate` exceeds the bound, of every step."""
-    # rows without one: the least that it can be
+    """Return for every step whether `TuningResult.estimate` exceeds the bound."""
+    # rows without an estimate: its lower bound
     studied = zip(row["studied_errors"], row["studied_residuals"], strict=True)
     least = max((error / residual for error, residual in studied if residual > 0.0), default=0.0)
     ratio, unseen = row.get("error_per_residual", least), row.get("unseen_error", 0.0)
@@ -174,7 +174,7 @@ def suspects(row: Row) -> list[bool]:
 
 
 def summary(rows: list[Row]) -> Row:
-    """Counts, the two kinds of promises apart."""
+    """Counts, separately for attained targets and refusals."""
     judged = [row for row in rows if row["errors"]]
     visible = [row for row in judged if max(row["errors"]) > 0.0]
     kinds = {
@@ -192,7 +192,7 @@ def summary(rows: list[Row]) -> Row:
         **{name: {"scenes": len(group), "held": sum(r["held"] for r in group)} for name, group in kinds.items()},
         "held": sum(row["held"] for row in judged) / max(len(judged), 1),
         "held of attained": sum(r["held"] for r in kinds["attained"]) / max(len(kinds["attained"]), 1),
-        # in float32 rounding hides all errors of many scenes
+        # in float32 rounding exceeds the errors of many scenes
         "with an error beyond rounding": {"scenes": len(visible), "held": sum(row["held"] for row in visible)},
         "held with rounding counted as error": sum(max(r["errors_with_rounding"]) <= r["promised"] for r in judged),
         "budgets": {
@@ -224,11 +224,11 @@ def summary(rows: list[Row]) -> Row:
 def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=200, help="how many (%(default)s)")
-    parser.add_argument("--error", type=float, default=1e-2, help="to tune for (%(default)g)")
+    parser.add_argument("--error", type=float, default=1e-2, help="target error (%(default)g)")
     parser.add_argument("--dtype", choices=("float32", "float64"), default="float32", help="(%(default)s)")
-    parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
-    parser.add_argument("--budgets", action="store_true", help="measure the budgets of kept scenes anew, all of them")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (%(default)s)")
+    parser.add_argument("--budgets", action="store_true", help="measure the budgets of all kept scenes again")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args(words)
     torch.set_num_threads(options.threads)
     kept = json.loads(options.out.read_text()) if options.out and options.out.exists() else {"rows": []}
@@ -238,7 +238,7 @@ def main(words: list[str]) -> None:
         row["scene"]: row for row in earlier_rows(options.out) if {"dtype": "float32", **row}.items() >= asked.items()
     }
     now = describe_run(torch.device("cpu"), options.threads)
-    # the promises stay those of the earlier run
+    # the bounds stay those of the earlier run
     header = {name: kept[name] for name in now} if options.budgets and rows else now
     for number in tqdm(range(options.scenes), desc="scenes", unit="scene"):
         if number not in rows:

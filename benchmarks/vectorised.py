@@ -1,8 +1,9 @@
-"""The same time step in plain vectorised torch: what a careful user would write without the compiled kernels.
+"""The same time step in plain vectorised torch, as an experienced user would write it without the compiled kernels.
 
-Gather and scatter are two products with sparse CSR matrices (all environments at once), every number of a tetrahedron
-is a plane [tets, batch], and rotations come from the same quartic as in the kernels: FOAM (Markley 1993), a fixed count
-of Newton steps from above and the closed form. No fallback for degenerate elements, no contacts, no residual.
+Gather and scatter are two products with sparse CSR matrices (all environments at once), and every number of a
+tetrahedron is a plane [tets, batch]. Rotations come from the same quartic as in the kernels: FOAM (Markley 1993), a
+fixed count of Newton steps from above and the closed form. No fallback for degenerate elements, no contacts, no
+residual.
 """
 
 from __future__ import annotations
@@ -21,19 +22,19 @@ from torchpd import Scene, State
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-NEWTON_STEPS = {torch.float32: 3, torch.float64: 4}  # as many as the kernels take for moderate strain
+NEWTON_STEPS = {torch.float32: 3, torch.float64: 4}  # as in the kernels, for moderate strain
 RELAXATION = 1.9
 
 
 def _csr(matrix: csr_matrix, dtype: torch.dtype) -> Tensor:
     indices = (torch.from_numpy(matrix.indptr.astype(np.int32)), torch.from_numpy(matrix.indices.astype(np.int32)))
-    with warnings.catch_warnings():  # torch calls its CSR tensors experimental
+    with warnings.catch_warnings():  # torch warns that CSR tensors are experimental
         warnings.simplefilter("ignore", UserWarning)
         return torch.sparse_csr_tensor(*indices, torch.from_numpy(matrix.data).to(dtype), size=matrix.shape)
 
 
 def _nearest_rotations(f: list[list[Tensor]], newton_steps: int) -> list[list[Tensor]]:
-    """Rotations of many matrices given by their entries f[row][column]."""
+    """Nearest rotations of many matrices, given by their entries f[row][column]."""
     cofactor = [
         [
             f[(i + 1) % 3][(j + 1) % 3] * f[(i + 2) % 3][(j + 2) % 3]
@@ -64,19 +65,19 @@ def _nearest_rotations(f: list[list[Tensor]], newton_steps: int) -> list[list[Te
 
 
 class VectorisedStep:
-    """One guarded step of a scene of solids, hard pins and gravity.
+    """One guarded Chebyshev step of a scene of solids, hard pins and gravity.
 
     Args:
-        scene: what there is; anything but solids, hard pins and gravity is refused.
+        scene: the scene; anything but solids, hard pins and gravity is refused.
         time_step: h [s].
-        iterations: of one step.
+        iterations: per step.
         dtype: precision.
     """
 
     def __init__(self, scene: Scene, time_step: float, iterations: int, dtype: torch.dtype) -> None:
         values = scene.values()
         if len(values.planes) or len(values.spheres) or values.damping or np.isfinite(values.pin_stiffness).any():
-            raise ValueError("VectorisedStep knows solids, hard pins and gravity only")
+            raise ValueError("VectorisedStep: scene must have solids, hard pins and gravity only")
         self.time_step, self.iterations, self.dtype = time_step, iterations, dtype
         corners = values.rest_positions[values.tets]
         rest = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)

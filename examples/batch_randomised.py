@@ -1,4 +1,4 @@
-"""Domain randomisation: environments side by side that differ in stiffness, mass and gravity, stepped together."""
+"""Domain randomisation: environments that differ in stiffness, mass and gravity, simulated in one batch."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def main() -> None:
     scene = tpd.Scene(bar, wall, tpd.Gravity(), tpd.Damping(1.0))
     sim = tpd.Simulator(scene, time_step=1 / 60, iterations=64, batch=options.batch)
 
-    # any material array may have a leading batch: one value, or one array, for each environment
+    # any material array may have a leading batch dimension: one value or array per environment
     generator = torch.Generator().manual_seed(0)
     random = torch.rand(options.batch, 3, generator=generator)
     youngs = 1e5 * 10.0 ** random[:, 0]  # 1e5 to 1e6 Pa

@@ -1,4 +1,4 @@
-"""A surface is filled with tetrahedra, falls on the ground, and the original surface, carried along, is written."""
+"""Fill a surface with tetrahedra, drop it on the ground, and write the motion of the original surface."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ TIME_STEP = 1 / 60  # s
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("surface", type=Path, nargs="?", help="file of a surface; default: an octopus")
-    parser.add_argument("--cells", type=int, default=16, help="of the lattice along the longest side")
+    parser.add_argument("surface", type=Path, nargs="?", help="surface file; default: an octopus")
+    parser.add_argument("--cells", type=int, default=16, help="lattice cells along the longest side")
     parser.add_argument("--steps", type=int, default=90, help="of 1/60 s")
     parser.add_argument("--youngs", type=float, default=2e4, help="Young's modulus [Pa]")
-    parser.add_argument("--out", type=Path, default=Path("dropped.glb"), help=".glb or .usdc: the motion; else the end")
+    parser.add_argument("--out", type=Path, default=Path("dropped.glb"), help="motion (.glb, .usdc) or final mesh")
     options = parser.parse_args()
 
     surface = tpd.TriMesh.from_file(options.surface) if options.surface else tpd.shapes.octopus()
@@ -31,7 +31,7 @@ def main() -> None:
     sim = tpd.Simulator(scene, TIME_STEP, iterations=64)
     track = sim.rollout(sim.rest_state(), options.steps, return_info=True, progress=True)
 
-    # the simulator moves the tetrahedra; every vertex of the surface is a fixed combination of four of their corners
+    # the simulator moves the tetrahedra; every surface vertex is a fixed combination of the corners of one
     frames = mesh.embedding.apply(track.positions[:, 0])
     triangles = mesh.embedding.surface.triangles
     if options.out.suffix in (".glb", ".usdc"):

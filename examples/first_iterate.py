@@ -1,4 +1,4 @@
-"""What the first iterate and the number of iterations of a step cost: errors against the converged step."""
+"""Effect of the first iterate and the number of iterations: errors of a step against the converged step."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TIME_STEP = 1 / 30  # s
 
 
 def build(youngs: float, iterations: int, tolerance: float = 0.0) -> tpd.Simulator:
-    """A bar that a wall holds, in float64."""
+    """A bar held by a wall, in float64."""
     mesh = tpd.shapes.box((1.0, 0.2, 0.2), (15, 3, 3))
     bar = tpd.Solid(mesh, youngs=youngs, density=1000.0)
     scene = tpd.Scene(bar, tpd.Pin(bar, mesh.vertices[:, 0] == 0.0), tpd.Gravity())
@@ -23,7 +23,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--youngs", type=float, default=3e5, help="Young's modulus [Pa]")
     parser.add_argument("--iterations", type=int, nargs="+", default=[4, 16, 64, 256])
-    parser.add_argument("--steps", type=int, default=5, help="taken before the one that is looked at")
+    parser.add_argument("--steps", type=int, default=5, help="steps before the one that is examined")
     options = parser.parse_args()
 
     accurate = build(options.youngs, iterations=4000, tolerance=1e-12)
@@ -36,7 +36,7 @@ def main() -> None:
     moved = (exact.positions - state.positions).norm()
     print(f"the step converges in {int(info.iterations)} iterations to a residual of {float(info.residual):.1e}\n")
 
-    # a tensor is any proposal, such as a network's: here one that knows a fifth of what the step will change
+    # a first iterate may be any tensor, such as a network's output: this one predicts a fifth of the change
     unchanged = state.positions + TIME_STEP * state.velocities
     guess = unchanged + 0.2 * (exact.positions - unchanged)
     print("error of the displacement, by first iterate:")

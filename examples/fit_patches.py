@@ -1,4 +1,4 @@
-"""Fit free-form patches to a surface, say how far they are from it, and save them: as patches and as a mesh."""
+"""Fit free-form patches to a surface, print their error, and save them as patches and as a mesh."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torchpd as tpd
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("mesh", nargs="?", type=Path, help="an oriented surface; the octopus when left out")
-    parser.add_argument("--patches", type=int, default=400, help="triangles of the base, at most")
+    parser.add_argument("mesh", nargs="?", type=Path, help="an oriented surface; default: the octopus")
+    parser.add_argument("--patches", type=int, default=400, help="most triangles of the base")
     parser.add_argument("--quadrics", type=int, default=100, help="at most")
-    parser.add_argument("--iterations", type=int, default=40, help="of each stage of the fit, at most")
-    parser.add_argument("--level", type=int, default=6, help="segments along an edge of the mesh that is written")
-    parser.add_argument("--out", type=Path, default=Path("patches.glb"), help="file for the mesh")
+    parser.add_argument("--iterations", type=int, default=40, help="most iterations of each stage of the fit")
+    parser.add_argument("--level", type=int, default=6, help="segments per patch edge in the written mesh")
+    parser.add_argument("--out", type=Path, default=Path("patches.glb"), help="mesh file")
     options = parser.parse_args()
 
     target = tpd.TriMesh.from_file(options.mesh) if options.mesh else tpd.shapes.octopus()

@@ -1,4 +1,4 @@
-"""Find how stiff the two halves of a bar are from how it was seen to move: gradients through many time steps."""
+"""Find the stiffness of both halves of a bar from its observed motion: gradients through many time steps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GUESS = 1.5e5  # Pa
 
 
 class Halves(torch.nn.Module):
-    """Stiffness of every tetrahedron [E] from the logarithms of two, one for each half of the bar.
+    """Stiffness of every tetrahedron [E] from the logarithms of two values, one for each half of the bar.
 
     The logarithm keeps a stiffness positive, and makes doubling as easy as halving.
     """
@@ -33,14 +33,14 @@ class Halves(torch.nn.Module):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=6, help="of 1/30 s that were seen")
+    parser.add_argument("--steps", type=int, default=6, help="observed steps of 1/30 s")
     parser.add_argument("--fits", type=int, default=8, help="steps of the optimiser")
     options = parser.parse_args()
 
     mesh = tpd.shapes.box((1.0, 0.2, 0.2), (10, 2, 2))
     bar = tpd.Solid(mesh, youngs=GUESS, density=1000.0)
     scene = tpd.Scene(bar, tpd.Pin(bar, mesh.vertices[:, 0] == 0.0), tpd.Gravity())
-    # gradients are those of converged steps, and as accurate as the steps are: iterate until little changes
+    # gradients are those of converged steps and as accurate as the steps: iterate until they change little
     sim = tpd.Simulator(scene, time_step=1 / 30, iterations=1000, dtype=torch.float64, tolerance=1e-7)
     half = torch.from_numpy((mesh.vertices[mesh.tets].mean(axis=1)[:, 0] > 0.5).astype(int))
 
@@ -67,7 +67,7 @@ def main() -> None:
     print("fit   beside the wall [Pa]   far from it [Pa]   distance [cm]")
     for fit in range(options.fits):
         youngs = logarithm.detach().exp().tolist()
-        distance = float(optimiser.step(loss)) ** 0.5  # at these values: measured before the optimiser goes on
+        distance = float(optimiser.step(loss)) ** 0.5  # at the printed values: evaluated before they are updated
         print(f"{fit:3d} {youngs[0]:22,.0f} {youngs[1]:18,.0f} {distance:15.5f}")
     youngs = logarithm.detach().exp().tolist()
     print(f"end {youngs[0]:22,.0f} {youngs[1]:18,.0f}   the truth: {TRUTH[0]:,.0f} and {TRUTH[1]:,.0f}")

@@ -1,4 +1,4 @@
-"""A bar is gripped at both ends; one grip turns and pulls. Pins go where a function of the step number puts them."""
+"""Grip a bar at both ends; one grip rotates and pulls. A function of the step number places the pins."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=60, help="of 1/60 s")
     parser.add_argument("--turn", type=float, default=180.0, help="degrees")
     parser.add_argument("--pull", type=float, default=0.2, help="[m]")
-    parser.add_argument("--soft", type=float, help="stiffness of the grip [N/m]; it holds exactly without")
+    parser.add_argument("--soft", type=float, help="stiffness of the grip [N/m]; default: it holds exactly")
     options = parser.parse_args()
 
     mesh = tpd.shapes.box((1.0, 0.2, 0.2), (20, 4, 4)).translated((0.0, -0.1, -0.1))
@@ -28,7 +28,7 @@ def main() -> None:
     held = torch.from_numpy(mesh.vertices[grip.vertices]).float()
 
     def targets(step: int) -> dict[tpd.Pin, torch.Tensor]:
-        """Where the grip is at the end of a step; the wall stays where it is because it is not named."""
+        """Positions of the grip at the end of a step; the wall is not named, so it stays."""
         share = (step + 1) / options.steps
         angle = math.radians(options.turn) * share
         turn = torch.tensor(

@@ -17,9 +17,9 @@ CAMERA = Camera((0.0, 0.6, 4.2), (0.0, 0.0, 0.0), 36.0)
 
 
 def body() -> tuple[tpd.FreeFormPatches, tpd.Quadrics]:
-    """A ball of 80 patches, and the bumps and dents that the pictures know of."""
+    """A ball of 80 patches, and the bumps and dents of the true pictures."""
     ball = tpd.TriMesh.from_trimesh(trimesh.creation.icosphere(subdivisions=1))
-    n = torch.arange(14, dtype=torch.float64)  # evenly over the ball, on a spiral
+    n = torch.arange(14, dtype=torch.float64)  # evenly distributed on a spiral over the ball
     y, turn = 1 - (2 * n + 1) / 14, math.pi * (3 - math.sqrt(5)) * n
     ring = (1 - y * y).sqrt()
     centres = torch.stack([ring * turn.cos(), y, ring * turn.sin()], dim=1)
@@ -29,7 +29,7 @@ def body() -> tuple[tpd.FreeFormPatches, tpd.Quadrics]:
 
 
 def turned(patches: tpd.FreeFormPatches) -> tpd.PatchPose:
-    """The body before the camera: stretched, and turned another way in every view."""
+    """The body in front of the camera: stretched, and rotated differently in every view."""
     transport = tpd.PatchTransport(patches, patches.vertices.mean(0, keepdim=True), torch.zeros(80, dtype=torch.int64))
     angles = torch.arange(VIEWS, dtype=torch.float64) * 2 * math.pi / VIEWS
     c, s, zero = angles.cos(), angles.sin(), torch.zeros(VIEWS, dtype=torch.float64)
@@ -40,14 +40,14 @@ def turned(patches: tpd.FreeFormPatches) -> tpd.PatchPose:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=80, help="of the optimiser")
-    parser.add_argument("--pixels", type=int, default=64, help="along the side of a picture")
-    parser.add_argument("--out", help="a picture (PNG): truth, start and end, above one another")
+    parser.add_argument("--pixels", type=int, default=64, help="pixels per side of a picture")
+    parser.add_argument("--out", help="picture file (PNG) with truth, start and end")
     options = parser.parse_args()
     patches, truth = body()
     pose, rays, size = turned(patches), tpd.PatchRays(patches), (options.pixels, options.pixels)
 
     def look(quadrics: tpd.Quadrics) -> tpd.PatchImage:
-        # bumps move and patches under them change: the lists have to follow
+        # bumps move to other patches: update the lists
         return rays.render(CAMERA, size, pose, patches=patches.with_quadrics(quadrics), light=(0.6, 1.0, 0.8))
 
     with torch.no_grad():

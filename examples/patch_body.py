@@ -1,4 +1,4 @@
-"""A torus of free-form patches falls on the ground; the surface follows its constraints and is written as a film."""
+"""Drop a torus of free-form patches on the ground; its surface follows the constraints and is written as a film."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("patches.glb"), help=".glb or .usdc")
     options = parser.parse_args()
 
-    # a bump or a dent on every vertex of a coarse torus, the highest a quarter of its radius
+    # a bump or a dent on every vertex of a coarse torus, the largest a quarter of its radius
     base = tpd.TriMesh.from_trimesh(trimesh.creation.torus(0.4, 0.15, major_sections=20, minor_sections=10))
     base = base.transformed(trimesh.transformations.rotation_matrix(1.0, [1, 0, 0])).translated((0.0, 0.8, 0.0))
     torch.manual_seed(0)
@@ -37,7 +37,7 @@ def main() -> None:
     sim = tpd.Simulator(tpd.Scene(body, tpd.Gravity(), tpd.Ground(friction=0.5)), TIME_STEP, iterations=64)
     track = sim.rollout(sim.rest_state(), options.steps, return_info=True, progress=True)
 
-    # every frame is a pose of the same patches: heights are of the material, evaluated once
+    # every frame is a pose of the same patches: heights are fixed in the material, so evaluate them once
     grid = patches.tessellate(options.level)
     pose = body.pose(track.positions.flatten(0, 1))
     frames = patches.surface(grid.samples, pose, heights=patches.heights(grid.samples)).points

@@ -1,4 +1,4 @@
-"""Find how a hand must move to push a block over rough ground to a goal: gradients through contacts and friction."""
+"""Find the motion of a hand that pushes a block over rough ground to a goal: gradients through contact and friction."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from torch import Tensor
 
 import torchpd as tpd
 
-GOAL = (0.09, 0.05, 0.06)  # m, of the middle of the block, which starts at (0.05, 0.05, 0.05)
+GOAL = (0.09, 0.05, 0.06)  # m, centre of the block, which starts at (0.05, 0.05, 0.05)
 RADIUS = 0.2  # m, of the hand
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--steps", type=int, default=20, help="of 1/60 s, in which the hand moves and the block stops")
+    parser.add_argument("--steps", type=int, default=20, help="steps of 1/60 s: the hand moves, then the block stops")
     parser.add_argument("--tries", type=int, default=20, help="steps of the optimiser")
     options = parser.parse_args()
 
     mesh = tpd.shapes.box((0.1, 0.1, 0.1), (4, 4, 4))
     hand = tpd.Sphere((-RADIUS, 0.05, 0.05), RADIUS, friction=0.8)
     scene = tpd.Scene(tpd.Solid(mesh, youngs=1e5), tpd.Gravity(), tpd.Ground(friction=0.4), hand)
-    # gradients are those of converged steps, and as accurate as the steps are
+    # gradients are those of converged steps, and as accurate as the steps
     sim = tpd.Simulator(scene, time_step=1 / 60, iterations=1000, dtype=torch.float64, tolerance=1e-6)
     goal, share = torch.tensor(GOAL, dtype=torch.float64), sim.masses / sim.masses.sum()
 
-    # how fast the hand goes in each step [m/s]: at first straight on, too slowly
+    # speed of the hand in each step [m/s]: straight ahead and too slow at first
     speed = torch.tensor([[0.06, 0.0, 0.0]], dtype=torch.float64).repeat(options.steps, 1).requires_grad_()
 
     def push() -> tuple[Tensor, Tensor]:
-        """Distance of the block's middle from the goal at the end, and where it is then [m]."""
+        """Distance of the block's centre from the goal at the end, and its position then [m]."""
         places = torch.tensor(hand.center, dtype=torch.float64) + sim.time_step * speed.cumsum(0)
         end = sim.rollout(sim.rest_state(), options.steps, targets=lambda step: {hand: places[step]}).state()
         middle = (share[:, None] * end.positions[0]).sum(0)

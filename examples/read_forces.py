@@ -1,4 +1,4 @@
-"""A clamped beam bends under its weight onto a ball: what clamp and ball carry, the stress, and files for ParaView."""
+"""Forces of clamp and sphere under a beam that bends by its weight, its stress, and files for ParaView."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=120, help="of 1/60 s")
     parser.add_argument("--youngs", type=float, default=1e5, help="Young's modulus [Pa]")
-    parser.add_argument("--out", type=Path, default=Path("beam.pvd"), help="beside it goes a .vtu of every tenth step")
+    parser.add_argument("--out", type=Path, default=Path("beam.pvd"), help="ParaView file, with a .vtu per ten steps")
     options = parser.parse_args()
 
     mesh = tpd.shapes.box((LENGTH, 0.1, 0.1), (20, 4, 4))
@@ -36,7 +36,7 @@ def main() -> None:
             contact.append(sim.contact_forces(before, state).force)
             reaction.append(sim.reactions(before, state).on_vertices)
 
-    # forces in the last step, with torques about the middle of the clamp
+    # forces in the last step, with torques about the centre of the clamp
     middle = torch.tensor([left, low + 0.05, 0.0], dtype=sim.dtype)
     contacts = sim.contact_forces(before, state, about=middle)
     pins = sim.reactions(before, state, about=middle)

@@ -1,4 +1,4 @@
-"""Train one network on several GPUs or processes, each of which simulates its own environments.
+"""Train one network on several GPUs or processes, each with its own environments.
 
 torchrun --nproc-per-node 2 examples/train_distributed.py
 """
@@ -17,7 +17,7 @@ import torchpd as tpd
 
 
 class Thrower(nn.Module):
-    """A network that chooses how fast to throw a cube, and the steps of its flight through the air."""
+    """A network that chooses the throwing speed of a cube, and the steps of the flight."""
 
     def __init__(self, sim: tpd.Simulator, steps: int) -> None:
         super().__init__()
@@ -25,7 +25,7 @@ class Thrower(nn.Module):
         self.network = nn.Sequential(nn.Linear(2, 32), nn.Tanh(), nn.Linear(32, 1))
 
     def forward(self, goal: Tensor) -> Tensor:
-        """Where the cubes of all environments are at the end, along x [B] [m]."""
+        """Final positions of the cubes of all environments along x [B] m."""
         known = torch.stack([goal, self.sim.damping], dim=1)
         speed = self.network(known)  # [B, 1] m/s
         start = self.sim.rest_state()
@@ -40,7 +40,7 @@ def train(options: argparse.Namespace) -> None:
     rank, ranks = dist.get_rank(), dist.get_world_size()
     device = torch.device("cuda", int(os.environ["LOCAL_RANK"])) if gpu else torch.device("cpu")
 
-    # every rank draws the numbers of all environments from one seed and takes its share of them
+    # every rank draws the random numbers of all environments from one seed and takes its share of them
     random = torch.rand(options.environments, 3, generator=torch.Generator().manual_seed(0))[rank::ranks].to(device)
     goal, drag, youngs = 0.5 * random[:, 0], 2.0 * random[:, 1], 1e4 * 10.0 ** random[:, 2]
     cube = tpd.Solid(tpd.shapes.box((0.1, 0.1, 0.1), (2, 2, 2)).translated((-0.05, 0.0, 0.0)), youngs=1e5)
@@ -64,7 +64,7 @@ def train(options: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--environments", type=int, default=64, help="of all ranks together")
+    parser.add_argument("--environments", type=int, default=64, help="environments of all ranks together")
     parser.add_argument("--steps", type=int, default=10, help="of 1/60 s")
     parser.add_argument("--updates", type=int, default=50, help="of the network")
     options = parser.parse_args()

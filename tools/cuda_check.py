@@ -1,13 +1,16 @@
-"""Compiles every CUDA source for the architectures that matter. Needs nvcc, but no GPU and no CUDA build of torch.
+"""Compile every CUDA source for the supported architectures. Needs nvcc, but no GPU and no CUDA build of torch.
 
-The C++ sources of a CUDA build are read too, as far as the compiler's syntax check goes.
+The C++ sources of a CUDA build get a syntax check.
 
-What ptxas says about registers, spills and shared memory is kept in build/cuda-check/, one report per source, and with
---table FILE as one table (CSV) of all kernels; benchmarks/results/cuda-registers.csv is the one of this repository.
---compare FILE compiles nothing: it fails if the table was made of other sources or flags. Comments, formatting, names
-of files and paths of includes do not count.
---quick takes one architecture a source, in turn, goes as far as PTX and, where nvcc can, optimises nothing, which is a
-thirtieth of the work. ptxas has compiled everything when the table was made, so CI compares it and checks quickly.
+The reports of ptxas on registers, spills and shared memory go to build/cuda-check/, one per source. --table FILE writes
+them as one table (CSV) of all kernels; this repository's is benchmarks/results/cuda-registers.csv.
+
+--compare FILE compiles nothing: it fails if the table is of other sources or flags. Comments, formatting, file names
+and include paths do not count. ptxas has compiled all sources when the table was written, so CI compares it and uses
+--quick.
+
+--quick compiles one architecture per source, in turn, to PTX and, if nvcc can, without optimisation: a thirtieth of the
+work.
 """
 
 from __future__ import annotations
@@ -32,7 +35,7 @@ ROOT = Path(__file__).resolve().parent.parent
 CSRC = ROOT / "csrc"
 REPORTS = ROOT / "build" / "cuda-check"
 TARGETS = ("80", "90")
-# to save time only the kernels that most steps run
+# only the most common kernels, to save time
 NEWER_TARGETS = ("100",)
 NEWER_SOURCES = (
     "small_batch_float.cu",
@@ -41,21 +44,21 @@ NEWER_SOURCES = (
     "stream_float.cu",
     "multilevel_float.cu",
 )
-# C++ that only a CUDA build of torch compiles, and what has parts for it
+# C++ sources that only a CUDA build of torch compiles, and those with CUDA parts
 GLUE = ("binding/cuda/ops.cpp", "freeform/cuda/ops.cpp", "binding/module.cpp")
-# a torch without CUDA lacks the header that says how its CUDA part was built
+# torch without CUDA lacks the header that describes its CUDA build
 GLUE_FLAGS = ("-std=c++20", "-Xcompiler=-fsyntax-only,-Wall,-Wextra,-Wno-psabi", "-DC10_CUDA_NO_CMAKE_CONFIGURE_FILE")
 
 
 def find_tool(name: str) -> str | None:
-    """A program of the toolkit: of CUDA_HOME, of the PATH, or of the usual place."""
+    """A program of the toolkit: from CUDA_HOME, PATH, or the default location."""
     home = os.environ.get("CUDA_HOME")
     candidates = [f"{home}/bin/{name}"] if home else [name, f"/usr/local/cuda/bin/{name}"]
     return next((found for found in map(shutil.which, candidates) if found), None)
 
 
 def include_folders() -> list[str]:
-    """Our headers, and those of torch and python for the sources that hold tensors."""
+    """Include folders of this repository, and of torch and python for the sources that use tensors."""
     from torch.utils.cpp_extension import include_paths
 
     system = [*include_paths(), sysconfig.get_path("include")]
@@ -63,7 +66,7 @@ def include_folders() -> list[str]:
 
 
 def nvcc_flags() -> tuple[str, ...]:
-    """Those that a build has."""
+    """The flags of a build."""
     flags: tuple[str, ...] = runpy.run_path(str(ROOT / "torchpd" / "common" / "toolkit.py"))["NVCC_FLAGS"]
     return flags
 
@@ -74,7 +77,7 @@ def targets_of(source: Path) -> tuple[str, ...]:
 
 
 def choose_targets(sources: Sequence[Path], *, quick: bool) -> dict[Path, tuple[str, ...]]:
-    """The architectures to compile for: all of a source, or one of them, in turn."""
+    """The architectures to compile each source for: all of them, or one in turn if `quick`."""
     targets = {source: targets_of(source) for source in sources}
     if quick:
         return {source: (all_of[i % len(all_of)],) for i, (source, all_of) in enumerate(targets.items())}
@@ -93,7 +96,7 @@ def command_for(
 
 
 def fast_flags(nvcc: str) -> list[str]:
-    """What makes an nvcc that knows it compile as fast as it can."""
+    """Flags for the fastest compilation that this nvcc supports."""
     described = subprocess.run([nvcc, "--help"], capture_output=True, text=True, check=False).stdout
     return ["--Ofast-compile=max"] if "--Ofast-compile" in described else []
 
@@ -103,7 +106,7 @@ def report_of(source: Path) -> Path:
 
 
 def compile_source(command: list[str], source: Path) -> bool:
-    """Compile one source, keep the report, and say what went wrong."""
+    """Compile one source, keep the report, and print errors."""
     name = source.relative_to(CSRC).as_posix()
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     report = report_of(source)
@@ -118,20 +121,20 @@ def compile_source(command: list[str], source: Path) -> bool:
 _ENTRY = re.compile(r"Compiling entry function '(?P<kernel>\w+)' for 'sm_(?P<architecture>\d+)'")
 _FRAME = re.compile(r"(?P<stack>\d+) bytes stack frame, (?P<spill_stores>\d+) bytes spill stores, (?P<spill_loads>\d+)")
 _USED = re.compile(r"Used (?P<registers>\d+) registers(?:.*?(?P<shared>\d+) bytes smem)?")
-# the fingerprint is in the first row alone
+# only the first row holds the fingerprint
 COLUMNS = (
     "source", "architecture", "kernel", "registers", "stack", "spill_stores", "spill_loads", "shared", "fingerprint",
 )  # fmt: skip
 
 
 def kernels_of(report: str) -> list[dict[str, str]]:
-    """What ptxas says of every kernel: bytes, but for registers."""
+    """Resources of every kernel in a ptxas report: bytes, except registers."""
     rows: list[dict[str, str]] = []
     for line in report.splitlines():
         if entry := _ENTRY.search(line):
             rows.append(entry.groupdict() | {"shared": "0"})
         elif not rows or "registers" in rows[-1]:
-            continue  # functions that kernels call, after the kernel's own lines
+            continue  # called functions, listed after the kernel's own lines
         elif frame := _FRAME.search(line):
             rows[-1] |= frame.groupdict()
         elif used := _USED.search(line):
@@ -140,7 +143,7 @@ def kernels_of(report: str) -> list[dict[str, str]]:
 
 
 def kernel_name(signature: str) -> str:
-    """A function as c++filt prints it, without what it returns and takes; template arguments stay."""
+    """A demangled function without its return type and arguments; template arguments stay."""
     depth = 0
     for place in reversed(range(len(signature) * signature.endswith(")"))):
         depth += {")": 1, "(": -1}.get(signature[place], 0)
@@ -156,7 +159,7 @@ _TOKEN = re.compile(r"""//.*|/\*[\s\S]*?\*/|^\s*#\s*include\b.*|\\\n|("(?:\\.|[^
 
 
 def with_headers(sources: Iterable[Path], root: Path) -> list[Path]:
-    """Sources and what they include of a folder, by name."""
+    """Sources and their includes within a folder, by name."""
     found: set[Path] = set()
     new = set(sources)
     while new:
@@ -167,7 +170,7 @@ def with_headers(sources: Iterable[Path], root: Path) -> list[Path]:
 
 
 def fingerprint(root: Path = CSRC) -> str:
-    """Hash of all that a table depends on but the compiler: flags, targets, and tokens of CUDA sources and headers."""
+    """Hash of a table's inputs except the compiler: flags, targets, and tokens of CUDA sources and headers."""
     sources = sorted(root.glob("**/*.cu"))
     parts = [repr(nvcc_flags())]
     for path in with_headers(sources, root):
@@ -177,14 +180,14 @@ def fingerprint(root: Path = CSRC) -> str:
 
 
 def read_table(path: Path) -> tuple[str, list[dict[str, str]]]:
-    """The fingerprint of what a table was made of, and its rows."""
+    """The fingerprint and the rows of a table."""
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return rows[0].get("fingerprint", ""), rows
 
 
 def write_table(path: Path, reports: list[Path], made_of: str) -> None:
-    """All kernels of some reports, by name, and the fingerprint of what they were made of."""
+    """Write all kernels of some reports, by name, and the fingerprint of their sources."""
     rows = [
         {"source": report.stem} | row for report in reports for row in kernels_of(report.read_text(encoding="utf-8"))
     ]
@@ -207,7 +210,7 @@ def write_table(path: Path, reports: list[Path], made_of: str) -> None:
 
 
 def compare_table(path: Path) -> int:
-    """Say whether a table was made of these sources: 0 if so, else 1."""
+    """Print whether a table is of the current sources; 0 if so, else 1."""
     made_of, now = read_table(path)[0], fingerprint()
     if made_of == now:
         print(f"cuda-check: {path} is of these sources ({now})")
@@ -222,17 +225,17 @@ def compare_table(path: Path) -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Compile every CUDA source; no GPU needed.")
-    parser.add_argument("--table", type=Path, help="file for a table of the kernels' registers and spills (CSV)")
-    parser.add_argument("--compare", type=Path, metavar="TABLE", help="fail if a table is of other sources")
-    parser.add_argument("--quick", action="store_true", help="PTX of one architecture a source, in turn")
+    parser.add_argument("--table", type=Path, help="output file for registers and spills of the kernels (CSV)")
+    parser.add_argument("--compare", type=Path, metavar="TABLE", help="fail if a table is of other sources or flags")
+    parser.add_argument("--quick", action="store_true", help="one architecture per source, in turn, to PTX")
     options = parser.parse_args()
     if options.compare is not None:
         return compare_table(options.compare)
     if options.quick and options.table is not None:
-        parser.error("--table is of all architectures, so it does not go with --quick")
+        parser.error("--table needs all architectures: leave out --quick")
     nvcc = find_tool("nvcc")
     if nvcc is None:
-        print("cuda-check: skipped, there is no nvcc (set CUDA_HOME to the folder of a CUDA toolkit)")
+        print("cuda-check: skipped, nvcc not found (set CUDA_HOME to the folder of a CUDA toolkit)")
         return 0
     sources = sorted(CSRC.glob("**/*.cu"))
     everything = [*sources, *(CSRC / name for name in GLUE)]
@@ -240,7 +243,7 @@ def main() -> int:
     folders = include_folders()
     REPORTS.mkdir(parents=True, exist_ok=True)
     fast = fast_flags(nvcc) if options.quick else []
-    made_of = fingerprint()  # now: who changes a source meanwhile makes the table stale
+    made_of = fingerprint()  # before compiling: a source edited meanwhile makes the table stale
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         passed = list(
             pool.map(

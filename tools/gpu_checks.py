@@ -1,17 +1,17 @@
-"""All checks that need a GPU, and their record: the test suite there, sanitizers, and errors that they must find.
+"""Run and record all checks that need a GPU: the test suite, sanitizers, and planted errors that they must find.
 
 python tools/gpu_checks.py --out benchmarks/results/gpu-checks-h100.json
-python tools/gpu_checks.py --only clean plants --jobs 16 --out ...                   # what --out has, stays
-python tools/gpu_checks.py --only clean --kernels block far --out ...                # those that a change touched
+python tools/gpu_checks.py --only clean plants --jobs 16 --out ...                   # keeps the other rows of --out
+python tools/gpu_checks.py --only clean --kernels block far --out ...                # only kernels that changed
 
 suite     the tests that use a GPU, counted by pytest
 list      every kernel of benchmarks/results/cuda-registers.csv runs in tools/sanitize.py
 clean     compute-sanitizer: memcheck, racecheck, initcheck and synccheck, each on all kernels, find nothing
-plants    and each finds the error that tools/sanitize.py --plant makes, in one of the kernels that run with each plan;
+plants    each tool finds the error that tools/sanitize.py --plant makes, in one of the kernels of each plan;
           synccheck has none
 
-racecheck looks at shared memory alone: what blocks exchange through the memory of the device is for the tests that
-compare the bits of runs. Exits with 1 where anything is not as wanted.
+racecheck examines shared memory only: the tests that compare the bits of runs cover messages between blocks through
+device memory. Exits with 1 if any check fails.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from torchpd.common.provenance import describe_run
 ROOT = Path(__file__).resolve().parent.parent
 KINDS = ("suite", "list", "clean", "plants")
 TOOLS = ("memcheck", "racecheck", "initcheck", "synccheck")
-FOUND = 86  # what a sanitizer that has found an error is to exit with
-SEPARATE = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}  # every tensor an allocation of its own
+FOUND = 86  # exit code of a sanitizer that has found an error
+SEPARATE = {"PYTORCH_NO_CUDA_MEMORY_CACHING": "1"}  # one allocation per tensor
 Row = dict[str, Any]
 
 
 class Check(NamedTuple):
-    """A command and the exit code that it is to have."""
+    """A command and its expected exit code."""
 
     kind: str
     name: str
@@ -66,7 +66,7 @@ class Check(NamedTuple):
 
 
 def checks(kinds: Sequence[str], kernels: Sequence[str] = RUNS) -> list[Check]:
-    """Those of tools/sanitize.py, longest first."""
+    """The checks of tools/sanitize.py, longest first."""
     program = [sys.executable, "tools/sanitize.py"]
 
     def guarded(tool: str, *words: str) -> list[str]:
@@ -83,13 +83,13 @@ def checks(kinds: Sequence[str], kernels: Sequence[str] = RUNS) -> list[Check]:
         Check("plants", f"{tool}, {kernel}", guarded(tool, "--plant", tool, "--kernel", kernel), FOUND)
         for tool in TOOLS[:-1]
         for kernel in RUNS
-        if kernel in kernels and (tool, kernel) != ("racecheck", "patches")  # which has no shared memory
+        if kernel in kernels and (tool, kernel) != ("racecheck", "patches")  # those have no shared memory
     ]
     return [check for check in found if check.kind in kinds]
 
 
 def run_suite(words: list[str]) -> Row:
-    """The tests with "cuda", "gpu" or "sanitize" in their names; counts from pytest's own report."""
+    """Run the tests with "cuda", "gpu" or "sanitize" in their names; counts come from pytest's report."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.xml"
         command = [sys.executable, "-m", "pytest", "-q", "-k", "cuda or gpu or sanitize", *words]
@@ -104,7 +104,7 @@ def run_suite(words: list[str]) -> Row:
 
 
 def counted(report: str) -> dict[str, Any]:
-    """Tests by how they ended, and the names of those that failed."""
+    """Number of tests by outcome, and the names of the failed ones."""
     cases = list(ET.fromstring(report).iter("testcase"))
     failed = [case for case in cases if case.find("failure") is not None or case.find("error") is not None]
     skipped = [case for case in cases if case.find("skipped") is not None]
@@ -113,7 +113,7 @@ def counted(report: str) -> dict[str, Any]:
 
 
 def record(out: Path | None, rows: list[Row]) -> None:
-    """With rows of earlier runs that this one does not repeat."""
+    """Write the rows, and the earlier rows of the file that this run does not repeat."""
     if out is None:
         return
     run = describe_run("", torch.device("cuda" if torch.cuda.is_available() else "cpu"), torch.get_num_threads())
@@ -121,7 +121,7 @@ def record(out: Path | None, rows: list[Row]) -> None:
     known = json.loads(out.read_text(encoding="utf-8"))["rows"] if out.exists() else []
     kept = [row for row in known if (row["kind"], row["name"]) not in own]
     rows = [*kept, *({**row, "commit": run["commit"], "created": run["created"]} for row in rows)]
-    # rows have a command, commit and time of their own
+    # each row has its own command, commit and time
     head = {name: run[name] for name in ("machine", "versions")}
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps({"schema": 1, **head, "rows": rows}, indent=1) + "\n", encoding="utf-8")
@@ -131,9 +131,9 @@ def main(words: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--kernels", nargs="+", choices=RUNS, default=RUNS, help="of sanitizers")
-    parser.add_argument("--jobs", type=int, default=8, help="sanitizers at a time (%(default)s)")
-    parser.add_argument("--pytest", type=shlex.split, default=[], help="more words for pytest, such as '-n 8'")
-    parser.add_argument("--out", type=Path, help="file for the record (JSON)")
+    parser.add_argument("--jobs", type=int, default=8, help="sanitizers in parallel (%(default)s)")
+    parser.add_argument("--pytest", type=shlex.split, default=[], help="more arguments for pytest, such as '-n 8'")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args(words)
     if not torch.cuda.is_available():
         parser.error("torch finds no CUDA device")

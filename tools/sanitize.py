@@ -1,22 +1,22 @@
-"""Runs every CUDA kernel on tiny meshes, for NVIDIA's sanitizer, which makes a program a hundred times slower:
+"""Run every CUDA kernel on tiny meshes for NVIDIA's sanitizer, which slows a program a hundredfold:
 
 compute-sanitizer --tool memcheck python tools/sanitize.py          and racecheck, initcheck, synccheck
-PYTORCH_NO_CUDA_MEMORY_CACHING=1 makes every tensor an allocation of its own, so that memcheck sees its end.
+PYTORCH_NO_CUDA_MEMORY_CACHING=1 gives every tensor its own allocation, so that memcheck sees its end.
 
-Mesh and device decide which instantiation of a kernel runs. `--list`, without a sanitizer, has the profiler say which
-ran, and exits with 1 where one of benchmarks/results/cuda-registers.csv did not. The scenes are chosen for an H100.
+Mesh and device decide which instantiation of a kernel runs. `--list`, without a sanitizer, profiles which ones ran, and
+exits with 1 if one of benchmarks/results/cuda-registers.csv did not. The scenes are chosen for an H100.
 
-That a tool reports nothing says something if it would report an error. `--plant TOOL` makes one that TOOL must report,
-for each kernel in a process of its own, since memcheck ends the one in which it finds something:
+Silence of a tool counts only if it would report an error. `--plant TOOL` makes one that TOOL must report. It runs each
+kernel in its own process, since memcheck ends the process in which it finds an error:
 
 PYTORCH_NO_CUDA_MEMORY_CACHING=1 compute-sanitizer --tool memcheck --error-exitcode 86 \\
-    python tools/sanitize.py --plant memcheck --kernel grid             has to exit with 86, whatever else it prints
+    python tools/sanitize.py --plant memcheck --kernel grid             must exit with 86, whatever else it prints
 
-memcheck    an array of the plan lacks its last number, or a patch ends behind its list: a kernel reads behind it
-initcheck   nobody has written the velocities that a step starts with, or the amplitudes of the patches
-racecheck   all pairs of a patch leave their forces in the same place of shared memory; the ops of free-form patches
-            have no shared memory, so there is none for them
-For synccheck there is none: the threads of a block part for no argument.
+memcheck    an array of the plan lacks its last number, or a patch ends behind its list: a kernel reads past the end
+initcheck   the initial velocities of a step, or the amplitudes of the patches, are uninitialised
+racecheck   all pairs of a patch write their forces to the same shared memory; the ops of free-form patches use no
+            shared memory and have no such error
+synccheck has no planted error: no argument makes the threads of a block diverge.
 """
 
 from __future__ import annotations
@@ -68,12 +68,12 @@ from torchpd.viewing.render import Camera
 
 TABLE = Path(__file__).resolve().parent.parent / "benchmarks" / "results" / "cuda-registers.csv"
 SOLVERS = (pd.Chebyshev(), pd.Jacobi(), pd.Chebyshev("classic", rho=0.9, delay=1))
-RUNS = (*KERNELS, "levels", "patches")  # and what the multilevel solver runs with, and the ops of free-form patches
+RUNS = (*KERNELS, "levels", "patches")  # plus the kernels of the multilevel solver and of free-form patches
 ops = torch.ops.torchpd
 
 
 def step_all_ways(sim: pd.Simulator, batch: int) -> None:
-    """step, step_, rollout; reports; starts; forces; a stiffness and masses of each environment."""
+    """Run step, step_ and rollout; reports, starts, forces; stiffness and masses per environment."""
     state = sim.rest_state(batch)
     state.velocities[..., 1] = -3.0 * state.positions[..., 0]
     forces = 0.1 * state.velocities
@@ -94,7 +94,7 @@ def step_all_ways(sim: pd.Simulator, batch: int) -> None:
 
 
 def fields(sim: pd.Simulator, batch: int) -> None:
-    """Every field op, for one stiffness and for one of each environment."""
+    """Run every field op, for one stiffness and for one per environment."""
     x = sim.rest_state(batch).positions * 1.1
     d, plan = 0.01 * x, list(sim.plan.arrays)
     one, *rest = sim.material()
@@ -109,7 +109,7 @@ def fields(sim: pd.Simulator, batch: int) -> None:
 
 
 def solve(sim: pd.Simulator, batch: int, material: list[torch.Tensor]) -> None:
-    """Conjugate gradients without contacts, with them and with what slides, from the first iteration and the second."""
+    """Conjugate gradients without contacts, with contacts and with sliding, from the first and the second iteration."""
     x, plan = sim.rest_state(batch).positions * 1.1, list(sim.plan.arrays)
     diagonal = ops.elastic_diagonal(material, plan, weighted=True)
     inertia, inverse = 0.1 * diagonal, 1.0 / (1.1 * diagonal)
@@ -126,7 +126,7 @@ def solve(sim: pd.Simulator, batch: int, material: list[torch.Tensor]) -> None:
 
 
 def adjoint(sim: pd.Simulator, batch: int) -> None:
-    """What stands around the solve, for a scene's contacts and without them."""
+    """Kernels around the adjoint solve, with a scene's contacts and without."""
     x, plan, h = sim.rest_state(batch).positions, list(sim.plan.arrays), sim.time_step
     d, error = 0.01 * x, torch.zeros(batch, dtype=torch.float64, device=x.device)
     material = [array.detach() for array in sim.material()]
@@ -140,7 +140,7 @@ def adjoint(sim: pd.Simulator, batch: int) -> None:
 
 
 def rotations(dtype: torch.dtype) -> None:
-    """Common and degenerate matrices, in no number of whole warps."""
+    """Common and degenerate matrices, not a multiple of the warp size."""
     matrices = torch.randn((77, 3, 3), generator=torch.Generator().manual_seed(0), dtype=dtype).cuda()
     matrices[5] = 0.0
     matrices[6] = float("nan")
@@ -150,7 +150,7 @@ def rotations(dtype: torch.dtype) -> None:
 
 
 def in_many_patches(sim: pd.Simulator) -> Plan:
-    """For the grid, with vertices of more patches than a row of senders holds."""
+    """A plan for the grid, with vertices in more patches than a row of senders holds."""
     arrays = compile_device_plan(sim.scene.values(), 48, PLAN_KERNELS.index("grid"), sim.dtype, progress=False)
     plan = Plan(arrays, DEVICE_PLAN_TABLE).to("cuda")
     if not bool((plan.slot_sender[:, 7] > 0).any()):
@@ -159,9 +159,9 @@ def in_many_patches(sim: pd.Simulator) -> Plan:
 
 
 def levels(dtype: torch.dtype) -> int:
-    """The multilevel solver: one block an environment, several, and several environments one after another.
+    """Run the multilevel solver: one block per environment, several, and several environments in sequence.
 
-    By levels, then directly.
+    First by levels, then directly.
     """
     small, large = BAR, bar(14, 4, 4)
     ways = (
@@ -177,7 +177,7 @@ def levels(dtype: torch.dtype) -> int:
         built = scene(mesh, contacts=contacts, pieces=contacts, pins=True)
         solver = pd.Multilevel(outer)  # type: ignore[arg-type]
         options: dict[str, Any] = {"solver": solver, "tolerance": 1e-2 * contacts, "dtype": dtype}
-        iterations = 5 if outer == "corotated" else 3  # the small problem is made after three
+        iterations = 5 if outer == "corotated" else 3  # the coarse problem is built after three
         with mock.patch.object(multilevel, "MOST_DIRECT", most_direct):
             sim = pd.Simulator(built, 1 / 60, iterations, progress=False, **options).to("cuda")
             step_all_ways(sim, batch)
@@ -192,7 +192,7 @@ def levels(dtype: torch.dtype) -> int:
 
 
 def free_form(dtype: torch.dtype) -> int:
-    """Every op of free-form patches and its adjoint, two poses at once."""
+    """Run every op of free-form patches and its adjoint, with two poses."""
     rng = np.random.default_rng(0)
     bases = (("flat", "base"), ("phong", "surface"))
     for base, measured_at in bases:
@@ -217,13 +217,13 @@ def free_form(dtype: torch.dtype) -> int:
 
 
 def every_way(kernel: str, dtype: torch.dtype) -> int:
-    """All instantiations of a kernel of KERNELS; everything that a step can have with the first mesh."""
+    """Run all instantiations of a kernel of KERNELS; all effects of a step with the first mesh."""
     count = 0
     flags = list(enumerate(itertools.product((False, True), repeat=2)))
     options: dict[str, Any] = {"dtype": dtype, "kernel": known_as(kernel), "progress": False}
     for way in WAYS[kernel]:
         with compiled_for(kernel, way):
-            # of the others all but contacts of bodies that are held, which have the kernels of loose ones
+            # contacts of held bodies only here: other meshes use the kernels of free bodies
             for number, (contacts, pieces) in flags if way is WAYS[kernel][0] else flags[:2] + flags[3:]:
                 solver, tolerance = SOLVERS[number % len(SOLVERS)], 1e-2 if number % 2 else 0.0
                 built = scene(way.mesh, contacts=contacts, pieces=pieces, pins=True)
@@ -231,18 +231,18 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
                 step_all_ways(sim, 3)
                 count += 1
                 if kernel == "stream" and dtype == torch.float32 and not contacts:
-                    # so many patches that blocks go from one to another, and know of the next by turns
+                    # enough patches that a block takes several and finds the next in turns
                     many = pd.Simulator(built, 1 / 60, 5, solver=solver, tolerance=tolerance, **options).to("cuda")
                     many(many.rest_state(70 * properties_of(sim.device).multiprocessors // sim.plan.patches))
                     count += 1
         fields(sim, 3)
         adjoint(sim, 3)
     if kernel == "block":
-        # whose block has a multiprocessor to itself, and several slots a thread
+        # its block has a multiprocessor to itself, and several slots per thread
         mesh = bar(9, 9, 9) if dtype == torch.float32 else bar(6, 6, 6)
         fields(pd.Simulator(pd.Scene(pd.Solid(mesh, 1e5)), 1 / 60, **options).to("cuda"), 2)
     if kernel == "grid":
-        # whose vertices are several parts in the adjoint's solve
+        # its vertices are in several parts in the adjoint's solve
         fields(pd.Simulator(pd.Scene(pd.Solid(bar(11, 9, 9), 1e5)), 1 / 60, **options).to("cuda"), 2)
     with compiled_for(kernel, WAYS[kernel][0]):
         free = scene(WAYS[kernel][0].mesh, contacts=True, pieces=True, pins=False)
@@ -258,7 +258,7 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
 
 
 def large_patches(dtype: torch.dtype) -> int:
-    """One step of each mesh."""
+    """Run one step of each mesh."""
     for way in WAYS["large"]:
         with compiled_for("large", way) as name:
             built = scene(way.mesh, contacts=False, pieces=False, pins=False)
@@ -268,7 +268,7 @@ def large_patches(dtype: torch.dtype) -> int:
 
 
 def several_environments(dtype: torch.dtype) -> int:
-    """Few of them, and as many as share blocks on an H100. In float64 none do."""
+    """Few environments, and enough to share blocks on an H100. In float64 they never share."""
     if dtype == torch.float64:
         return 0
     count = 0
@@ -277,20 +277,20 @@ def several_environments(dtype: torch.dtype) -> int:
         for solver, tolerance in ((SOLVERS[0], 0.0), (SOLVERS[0], 1e-2), (SOLVERS[1 + count % 2], 0.0)):
             options: dict[str, Any] = {"solver": solver, "tolerance": tolerance, "progress": False}
             sim = pd.Simulator(built, 1 / 60, 5, kernel="block", **options).to("cuda")
-            # the last block has fewer than the others
+            # the last block has fewer environments than the others
             many = sim.rest_state(6 * properties_of(sim.device).multiprocessors + 7)
             sim(many, return_info=not tolerance)
             if tolerance == 0.0:
                 step_all_ways(sim, 3)
             count += 1
-    # some blocks have others once they are done
+    # some blocks take further environments when done
     sim.set_material(stiffness=sim.stiffness[0], masses=sim.masses[0])
     sim(sim.rest_state(40 * properties_of(sim.device).multiprocessors + 3))
     return count + 1
 
 
 def run(kernel: str) -> int:
-    """How many simulators have run, in both precisions."""
+    """Run all of a kernel in both precisions; returns the number of simulators."""
     if kernel == "cluster" and properties_of(torch.device("cuda", 0)).cluster == 1:
         print("no clusters: this GPU has none (compute capability 9.0)")
         return 0
@@ -307,25 +307,25 @@ def run(kernel: str) -> int:
 
 
 def plain(name: str) -> str:
-    """The name of a kernel without what it takes, and without blanks, which demanglers set in different places."""
+    """The name of a kernel without arguments and blanks, which demanglers place differently."""
     return "".join(kernel_name(name).split())
 
 
 def expected_kernels(*, clusters: bool) -> set[str]:
-    """All of the table."""
+    """All kernels of the table."""
     with TABLE.open(encoding="utf-8", newline="") as file:
         names = {plain(row["kernel"]) for row in csv.DictReader(file)}
     return {name for name in names if clusters or not ("::fused_step<" in name and "::Blocks)1," in name)}
 
 
 def launches(seen: profile) -> Counter[str]:
-    """Of our kernels."""
+    """Launches of this library's kernels."""
     names = (plain(event.name) for event in seen.events() if event.device_type == DeviceType.CUDA)
     return Counter(name for name in names if name.startswith("pd::"))
 
 
-def say_what_ran(ran: Counter[str], expected: set[str]) -> bool:
-    """Whether all did that are expected to, and no others."""
+def report_missing(ran: Counter[str], expected: set[str]) -> bool:
+    """Print and return whether exactly the expected kernels ran."""
     for name, times in sorted(ran.items()):
         print(f"{times:7} {name}")
     missing, unknown = sorted(expected - ran.keys()), sorted(ran.keys() - expected)
@@ -344,8 +344,8 @@ def main(words: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kernel", nargs="+", choices=RUNS, default=RUNS)
     only = parser.add_mutually_exclusive_group()
-    only.add_argument("--plant", choices=("memcheck", "initcheck", "racecheck"), help="make an error; see above")
-    only.add_argument("--list", action="store_true", help="say which kernels run, and whether any never does")
+    only.add_argument("--plant", choices=("memcheck", "initcheck", "racecheck"), help="plant an error; see above")
+    only.add_argument("--list", action="store_true", help="list the kernels that run; fail if one never does")
     options = parser.parse_args(words)
     if not torch.cuda.is_available():
         parser.error("torch finds no CUDA device")
@@ -366,7 +366,7 @@ def main(words: list[str]) -> int:
     if not options.list:
         return 0
     clusters = properties_of(torch.device("cuda", 0)).cluster > 1
-    return 0 if say_what_ran(ran, expected_kernels(clusters=clusters)) else 1
+    return 0 if report_missing(ran, expected_kernels(clusters=clusters)) else 1
 
 
 if __name__ == "__main__":

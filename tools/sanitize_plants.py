@@ -1,4 +1,4 @@
-"""Errors that a sanitizer must report: what `tools/sanitize.py --plant` makes."""
+"""The errors of `tools/sanitize.py --plant`, which a sanitizer must report."""
 
 from __future__ import annotations
 
@@ -8,37 +8,37 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from sanitize_scenes import BAR, WAYS, Way, ball_of_patches, compiled_for, samples_everywhere, scene
+from sanitize_scenes import BAR, WAYS, KernelCase, ball_of_patches, compiled_for, samples_everywhere, scene
 from torch import Tensor
 
 import torchpd as pd
 
 
 def change_plan(sim: pd.Simulator, name: str, change: Callable[[Tensor], Tensor]) -> None:
-    """Puts another array into the plan."""
+    """Replace an array of the plan."""
     rows = zip(sim.plan.table, sim.plan.arrays, strict=True)
     sim.plan = replace(sim.plan, arrays=tuple(change(array) if row.name == name else array for row, array in rows))
 
 
 def ends_alone(array: Tensor) -> Tensor:
-    """The array, of a size that lets nothing begin at its end."""
+    """Return the array if no allocation can begin at its end."""
     if array.numel() * array.element_size() % 256 == 0:  # allocations begin at multiples of it
         raise RuntimeError("what lies behind may be another tensor; take a scene of another size")
     return array
 
 
 def without_last(array: Tensor) -> Tensor:
-    """The size of part_slot is the only one that no other number of the plan tells: the ops take it as it comes."""
+    """Shorten part_slot, the only array whose size the ops cannot check against other numbers of the plan."""
     return ends_alone(array[:-1].clone())
 
 
 def into_one_place(corners: Tensor) -> Tensor:
-    """Every corner that has an entry gets the first one: in the upper 16 bits, 65535 where there is none."""
+    """Give every corner with an entry the first one: in the upper 16 bits, 65535 without an entry."""
     return torch.where(corners >> 16 == -1, corners, corners & 65535)
 
 
 def behind_list(patches: pd.FreeFormPatches) -> pd.FreeFormPatches:
-    """The last patch has an entry more than there are."""
+    """Make the last patch's list end one entry past the array."""
     names = dict(zip(("triangles", "patch_start", "entry_quadric"), patches.lists, strict=False))
     ends_alone(names["entry_quadric"])
     names["patch_start"][-1] += 1
@@ -46,7 +46,7 @@ def behind_list(patches: pd.FreeFormPatches) -> pd.FreeFormPatches:
 
 
 def plant_in_patches(tool: str) -> None:
-    """Heights in which `tool` must find an error."""
+    """Evaluate heights in which `tool` must find an error."""
     patches = ball_of_patches().to("cuda")
     samples = samples_everywhere(patches)
     if tool == "memcheck":
@@ -59,14 +59,14 @@ def plant_in_patches(tool: str) -> None:
 
 
 def planted_scene(kernel: str) -> pd.Scene:
-    """Of a mesh that is not so small that a block has one warp, which has nobody to race with."""
+    """A scene large enough that a block has several warps, which can race."""
     mesh = WAYS[kernel][0].mesh if kernel in ("block", "far", "large") else BAR
     return scene(mesh, contacts=False, pieces=True, pins=False)
 
 
 def plant_in_step(tool: str, kernel: str) -> None:
-    """A step in which `tool` must find an error."""
-    with compiled_for(kernel, Way(BAR, {}) if kernel == "levels" else WAYS[kernel][0]) as name:
+    """Run a step in which `tool` must find an error."""
+    with compiled_for(kernel, KernelCase(BAR, {}) if kernel == "levels" else WAYS[kernel][0]) as name:
         options: dict[str, Any] = {"solver": pd.Multilevel()} if kernel == "levels" else {"kernel": name}
         sim = pd.Simulator(planted_scene(kernel), 1 / 60, 5, progress=False, **options).to("cuda")
     state = sim.rest_state(2)
@@ -80,7 +80,7 @@ def plant_in_step(tool: str, kernel: str) -> None:
 
 
 def plant(tool: str, kernel: str) -> None:
-    """An error that `tool` must find."""
+    """Make an error that `tool` must find."""
     if kernel == "patches":
         plant_in_patches(tool)
     else:
@@ -89,11 +89,11 @@ def plant(tool: str, kernel: str) -> None:
 
 
 def why_not_plant(tool: str, kernels: Sequence[str]) -> str:
-    """What keeps an error from being made; empty where nothing does."""
+    """The reason why an error cannot be made; empty if it can."""
     if len(kernels) != 1:
-        return "--plant wants one kernel: --kernel grid"
+        return "--plant needs one kernel: --kernel grid"
     if tool == "racecheck" and kernels[0] == "patches":
-        return "the ops of free-form patches have no shared memory that racecheck could look at"
+        return "the ops of free-form patches use no shared memory for racecheck to examine"
     if tool != "racecheck" and os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") != "1":
-        return "the tool sees single tensors with PYTORCH_NO_CUDA_MEMORY_CACHING=1 alone"
+        return "the tool needs PYTORCH_NO_CUDA_MEMORY_CACHING=1 to see single tensors"
     return ""

@@ -1,13 +1,13 @@
-"""Times changes to the kernels of one CUDA source side by side, on a GPU, with the extension built in place:
+"""Time changes to the kernels of one CUDA source side by side, on a GPU, with the extension built in place:
 
 python tools/variants.py stream_float one-1M --patch wide.patch fewer.patch --tets 2304 2560
 
-Two GPUs of a kind differ by a tenth in clock, so only times of one run compare. Each patch (as `git diff` writes it) is
-applied to a copy of csrc/, and the source compiled anew and linked with the other objects as they are: it may change
-kernels and their launches, but no plan, and nothing that other sources see. The scene is one of
-benchmarks/gpu_scenes.py; --tets are tetrahedra of a patch of kernel "stream". The tree itself comes first and once more
-at the end. A row has microseconds of an iteration, of a step of 64 and from 64 to 128 of them, and a hash of the
-positions after four steps: the same bits or not.
+Clocks of equal GPUs differ by a tenth, so compare only times of one run. Each patch (in the format of `git diff`) is
+applied to a copy of csrc/. The source is recompiled and linked with the other objects unchanged. A patch may therefore
+change kernels and their launches, but no plan, and nothing visible to other sources. The scene is one of
+benchmarks/gpu_scenes.py; --tets are tetrahedra per patch of kernel "stream". The unchanged tree runs first and last. A
+row has microseconds per iteration, of a step of 64 and from 64 to 128 of them. A hash of the positions after four steps
+compares the bits.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ LIBRARIES = ("c10", "torch", "torch_cpu", "torch_python", "cudart", "c10_cuda", 
 
 
 def run(*command: object, folder: Path = ROOT) -> None:
-    """Run a command, or end with what it says."""
+    """Run a command, or exit with its output."""
     words = [str(word) for word in command]
     result = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
     if result.returncode != 0:
@@ -48,7 +48,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 
 def apply(patch: Path, folder: Path) -> None:
-    """Change the copy of csrc/ in a folder as a patch says; what it does elsewhere is left out."""
+    """Apply a patch to the copy of csrc/ in a folder; changes outside csrc/ are ignored."""
     before = contents(folder / "csrc")
     run("git", "apply", "--include=csrc/*", patch.resolve(), folder=folder)
     if contents(folder / "csrc") == before:
@@ -56,17 +56,17 @@ def apply(patch: Path, folder: Path) -> None:
 
 
 def is_up_to_date(folder: Path) -> bool:
-    """Whether ninja, that of this environment first, would make nothing anew in a folder."""
+    """Return whether ninja (that of this environment first) has nothing to do in a folder."""
     places = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     ninja = shutil.which("ninja", path=places)
     if ninja is None:
-        sys.exit("tools/variants.py needs ninja, with which the extension is built: run `pip install ninja`.")
+        sys.exit("tools/variants.py needs ninja, which builds the extension: run `pip install ninja`.")
     left = subprocess.run([ninja, "-n", "-C", str(folder)], capture_output=True, text=True, check=False)
     return "no work to do" in left.stdout
 
 
 def objects() -> list[Path]:
-    """Of the extension that was built in place, for this python and torch, one of every source."""
+    """The objects of the extension built in place for this python and torch, one per source."""
     folder = f"{sysconfig.get_platform()}-{sys.implementation.cache_tag}-torch-{torch.__version__}"
     sources = [path.relative_to(ROOT) for kind in ("*.cpp", "*.cu") for path in (ROOT / "csrc").rglob(kind)]
     built = ROOT / "build" / folder
@@ -77,7 +77,7 @@ def objects() -> list[Path]:
 
 
 def make_variant(folder: Path, source: str, patch: Path | None, linked: list[Path], flags: Sequence[str]) -> None:
-    """A package with an extension of its own in `folder`."""
+    """Make a package with its own extension in `folder`."""
     package = folder / "torchpd"
     shutil.copytree(ROOT / "torchpd", package, ignore=shutil.ignore_patterns("_C*.so", "__pycache__"))
     shutil.copytree(ROOT / "csrc", folder / "csrc")
@@ -96,7 +96,7 @@ def make_variant(folder: Path, source: str, patch: Path | None, linked: list[Pat
 
 
 def measure(name: str, scene_name: str, tets: int | None, plans: Path) -> None:
-    """Print one row; in a process of its own, since torch loads an extension once."""
+    """Print one row; run in its own process, since torch loads an extension once."""
     sys.path.insert(0, str(ROOT / "benchmarks"))
     from gpu_scenes import GPU_SCENES
     from gpu_timing import graph_times
@@ -130,7 +130,7 @@ def measure(name: str, scene_name: str, tets: int | None, plans: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("source", help="a source of csrc without its .cu")
+    parser.add_argument("source", help="name of a CUDA source in csrc without .cu")
     parser.add_argument("scene")
     parser.add_argument("--patch", type=Path, nargs="*", default=[])
     parser.add_argument("--tets", type=int, nargs="*", default=[None])
@@ -141,7 +141,7 @@ def main() -> None:
         measure(name, options.scene, options.tets[0], Path(plans))
         return
     if not torch.cuda.is_available():
-        sys.exit("tools/variants.py times kernels, and torch sees no GPU here.")
+        sys.exit("tools/variants.py times kernels and needs a GPU; torch sees none.")
     linked, flags = objects(), runpy.run_path(str(ROOT / "torchpd" / "common" / "toolkit.py"))["NVCC_FLAGS"]
     patches: dict[str, Path | None] = {"as it is": None, **{str(patch): patch for patch in options.patch}}
     failed = False
@@ -157,7 +157,7 @@ def main() -> None:
                 command = [sys.executable, __file__, options.source, options.scene, *size, "--measure", name, made]
                 failed |= subprocess.run(command, env=environment, check=False).returncode != 0
     if failed:
-        sys.exit("not every variant could be measured")
+        sys.exit("some variants could not be measured")
 
 
 if __name__ == "__main__":

@@ -1,15 +1,16 @@
 """One step of a body in Newton's SolverVBD and SolverXPBD, in MuJoCo's flex, and here: error against time.
 
-Same mesh, lumped masses, density, Young's modulus, Poisson ratio 0 where the method allows it, gravity, time step
-1/30 s, start. A method is judged by the distance from its own converged answer, |u - u*| / |u_0 - u*| with u_0 = h v
-for all, so that no method is blamed for its material; the distance from ours stands beside it.
+All have the same mesh, lumped masses, density, Young's modulus, gravity, time step 1/30 s and start; the Poisson ratio
+is 0 where the method allows it. A method is judged by the distance from its own converged solution,
+|u - u*| / |u_0 - u*| with u_0 = h v for all. Differences of the material therefore do not count; the distance from this
+library's solution stands beside it.
 
-VBD and XPBD take one step as we do, with n iterations. u* of VBD is the minimum of its energy in float64, with which
-its own long run agrees to the rounding of float32; of XPBD its own longest run, where that has settled. MuJoCo has no
-iterations: it and we take the same 1/30 s in n steps, u* being the answer with the most of them.
+VBD and XPBD take one step with n iterations, as this library does. u* of VBD is the minimum of its energy in float64;
+its own longest run agrees with that to the rounding of float32. u* of XPBD is its longest run, if that has settled.
+MuJoCo has no iterations: it and this library take the same 1/30 s in n steps, and u* has the most steps.
 
-Newton and MuJoCo are optional: pip install newton warp-lang mujoco. What is not there is left out, and said.
-Cases that were measured are kept: a run that was stopped goes on.
+Newton and MuJoCo are optional: pip install newton warp-lang mujoco. Missing ones are reported and left out.
+Measured cases are kept: an interrupted run resumes.
 
     python -m benchmarks.peers --cells 3 5 8 12 --youngs 1e4 1e5 1e6 1e7 --out benchmarks/results/peers-cpu.json
     python -m benchmarks.peers --device cuda --cells 3 5 8 12 --out benchmarks/results/peers-cuda.json
@@ -41,18 +42,18 @@ from .report import draw, table
 
 GOALS = (1e-1, 1e-2, 1e-3)
 LONGEST = 4096  # iterations of a method
-# of a frame, the last being the converged answer
+# substeps of a frame; the last gives the converged solution
 SUBSTEPS = {
     "torchpd, substeps": [2**k for k in range(10)],
     "MuJoCo flex, substeps": [2**k for k in range(10)],
 }
 SETTLED = 1e-2  # relative change over the second half of a longest run
 Row = dict[str, Any]
-Answer = tuple[Array, float]  # u* and the residual that is left, or the change of the last doubling
+Answer = tuple[Array, float]  # u* and its remaining residual, or the change of the last doubling
 
 
 def _own_end(method: Method, longest: int) -> Answer:
-    """The method's answer after `longest` iterations, and how much the second half of them changed."""
+    """The method's solution after `longest` iterations, and its change over the second half of them."""
     half, end = method.run(longest // 2), method.run(longest)
     change = float(np.linalg.norm(end - half) / max(np.linalg.norm(end), 1e-300))
     if not change < SETTLED:
@@ -61,7 +62,7 @@ def _own_end(method: Method, longest: int) -> Answer:
 
 
 def _solvers(problem: Problem, device: str) -> dict[str, Callable[[], tuple[Method, Answer]]]:
-    """Methods of one implicit Euler step, each with its own converged answer."""
+    """Methods of one implicit Euler step, each with its own converged solution."""
 
     def neo_hookean() -> tuple[Method, Answer]:
         method = newton_physics.vbd(problem, device)
@@ -81,7 +82,7 @@ def _solvers(problem: Problem, device: str) -> dict[str, Callable[[], tuple[Meth
 
 
 def _frames(problem: Problem, device: str) -> dict[str, Callable[[], tuple[Method, Answer]]]:
-    """Methods whose knob is the time step."""
+    """Methods whose accuracy depends on the time step only."""
 
     def judged(name: str, make: Callable[[Problem, str], Method]) -> tuple[Method, Answer]:
         method, most = make(problem, device), SUBSTEPS[name][-1]
@@ -106,7 +107,7 @@ def measure(problem: Problem, name: str, method: Method, end: Answer, counts: li
 
 
 def run_problem(problem: Problem, options: argparse.Namespace, known: dict[str, Row]) -> list[Row]:
-    """A row for every method; what is missing or refuses stays, with its reason."""
+    """A row for every method; missing or refused methods keep a row with the reason."""
     iterations = [2**k for k in range(int(np.log2(LONGEST)) + 1)]
     cases = {name: (make, iterations) for name, make in _solvers(problem, options.device).items()}
     if len(problem.mesh.vertices) <= options.frames:
@@ -121,7 +122,7 @@ def run_problem(problem: Problem, options: argparse.Namespace, known: dict[str, 
 
 
 def _ours(problem: Problem, name: str, device: str) -> Array:
-    """Our answer to what a method was asked: the converged step, or the frame with the most substeps."""
+    """This library's solution for a method's problem: the converged step, or the frame with the most substeps."""
     if name in SUBSTEPS:
         return ours.substeps(problem, device).run(SUBSTEPS["torchpd, substeps"][-1])
     return ours.converged(problem)[0]
@@ -149,7 +150,7 @@ def _measured(
 
 
 def versions() -> dict[str, str]:
-    """Of the simulators that are there; says which are not."""
+    """Versions of the installed simulators; missing ones are named."""
 
     def ask(package: ModuleType) -> dict[str, str]:
         try:
@@ -166,19 +167,19 @@ def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers", description=__doc__.splitlines()[0])
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument(
-        "--cells", type=int, nargs="*", default=[3, 5], help="of beams: 3 5 8 12 have 256 to 10309 vertices"
+        "--cells", type=int, nargs="*", default=[3, 5], help="cells of beams: 3 5 8 12 have 256 to 10309 vertices"
     )
-    parser.add_argument("--mesh", nargs="*", default=[], help="tetrahedral meshes, beside the beams")
+    parser.add_argument("--mesh", nargs="*", default=[], help="tetrahedral meshes, besides the beams")
     parser.add_argument("--youngs", type=float, nargs="*", default=[1e4, 1e5, 1e6, 1e7], help="Young's moduli [Pa]")
     parser.add_argument(
-        "--seconds", type=float, default=5.0, help="of one run, at which a method gives up (%(default)g)"
+        "--seconds", type=float, default=5.0, help="time limit of a run, after which a method stops (%(default)g)"
     )
     parser.add_argument(
-        "--frames", type=int, default=1000, help="vertices up to which substeps are compared (%(default)s)"
+        "--frames", type=int, default=1000, help="most vertices for a comparison of substeps (%(default)s)"
     )
-    parser.add_argument("--threads", type=int, default=1, help="of the CPU (%(default)s)")
-    parser.add_argument("--out", type=Path, help="file for the result (JSON)")
-    parser.add_argument("--figure", type=Path, help="file for a picture of the errors against time")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (%(default)s)")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
+    parser.add_argument("--figure", type=Path, help="picture file of the errors against time")
     options = parser.parse_args(words)
     torch.set_num_threads(options.threads)
     stored = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []

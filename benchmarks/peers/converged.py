@@ -1,7 +1,7 @@
-"""Implicit Euler with any elastic energy, minimised in float64: what a method that uses this energy converges to.
+"""Implicit Euler with any elastic energy, minimised in float64: the converged solution of a method with this energy.
 
-L-BFGS with the multilevel preconditioner of the same body, which fits because all these energies are
-projective dynamics' to first order or are bounded by some multiple of it; gradients by torch.
+L-BFGS with the multilevel preconditioner of the same body; gradients by torch. The preconditioner fits because each of
+these energies equals that of projective dynamics to first order, or a multiple of it bounds them.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ import torchpd as pd
 from .problem import GRAVITY, Problem
 
 Array = NDArray[np.float64]
-Density = Callable[[Tensor], Tensor]  # energy a volume [E] Pa of F [E, 3, 3]
+Density = Callable[[Tensor], Tensor]  # energy per volume [E] Pa of F [E, 3, 3]
 
 _PAIRS = 12
 _ITERATIONS = 400
-_SOLVED = 1e-9  # |grad E| over that of the start
+_SOLVED = 1e-9  # |grad E| over that at the start
 
 
 def stable_neo_hookean(mu: float, lame: float) -> Density:
-    """Smith, De Goes and Kim 2018 without the logarithm, as Newton's SolverVBD has it (Lame's mu and lambda in Pa)."""
+    """Smith, De Goes and Kim 2018 without the logarithm, as in Newton's SolverVBD (Lame's mu and lambda in Pa)."""
     volume = lame + mu
     alpha = 1.0 + mu / volume
     return lambda f: (
@@ -36,10 +36,10 @@ def stable_neo_hookean(mu: float, lame: float) -> Density:
 
 
 def minimise(problem: Problem, density: Density) -> tuple[Array, float]:
-    """The displacement [V, 3] m, and |grad E| there over that at the first iterate."""
+    """The minimising displacement [V, 3] m, and |grad E| there over that at the first iterate."""
     sim = pd.Simulator(
         problem.scene(), problem.time_step, 0, pd.Multilevel(), torch.float64, progress=False
-    )  # its preconditioner only
+    )  # only for its preconditioner
     values = sim.scene.values()
     tets = torch.from_numpy(values.tets)
     rest = torch.from_numpy(values.rest_positions)

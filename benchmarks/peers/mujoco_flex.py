@@ -1,7 +1,7 @@
 """MuJoCo's flex on the CPU: Saint Venant-Kirchhoff, one linearly implicit step (integrator "discrete").
 
-There are no iterations to spend on accuracy: the time step is its only knob, so that it is compared over the same time
-in n substeps. Masses are lumped as ours are.
+It has no iterations to spend on accuracy; the time step is its only parameter. The comparison therefore covers the same
+time in n substeps. Masses are lumped as in this library.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _words(numbers: NDArray[Any]) -> str:
 
 
 def flex(problem: Problem, device: str) -> Method:
-    """The body as a flex with a vertex a body; n substeps."""
+    """The body as a flex with one vertex per body; n substeps."""
     mujoco = _package()
     if device != "cpu":
         raise MissingPackageError("MuJoCo is left out: its flex is compared on the CPU only")

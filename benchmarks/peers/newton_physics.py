@@ -1,8 +1,8 @@
 """Newton (newton-physics, on Warp): SolverVBD and SolverXPBD, on the CPU (one thread) or a GPU (a CUDA graph).
 
-VBD has the stable Neo-Hookean energy, which at Poisson ratio 0 (mu = E / 2, lambda = 0) agrees with ours for small
-strain. XPBD has two constraints a tetrahedron, tr(F^T F) - 3 and det F - 1, which resist shear to second order only,
-and needs lambda > 0: no setting gives our material, here lambda = mu.
+VBD has the stable Neo-Hookean energy. At Poisson ratio 0 (mu = E / 2, lambda = 0) it agrees with this library's for
+small strain. XPBD has two constraints per tetrahedron, tr(F^T F) - 3 and det F - 1. They resist shear to second order
+only and need lambda > 0, so no setting gives this library's material; here lambda = mu.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .problem import GRAVITY, Method, MissingPackageError, Problem
 from .timing import fastest
 
 Array = NDArray[np.float64]
-_RELAXATION = 0.1  # of XPBD: its default, 0.9, blows up on these meshes, and 0.3 ends elsewhere or blows up
+_RELAXATION = 0.1  # of XPBD: the default 0.9 diverges on these meshes; 0.3 diverges or converges elsewhere
 
 
 def _packages() -> tuple[Any, Any]:
@@ -44,7 +44,7 @@ def _model(problem: Problem, device: str, lame: float) -> Any:
         vertices=[warp.vec3(*map(float, vertex)) for vertex in problem.mesh.vertices],
         indices=problem.mesh.tets.reshape(-1).tolist(), density=DENSITY, k_mu=problem.youngs / 2.0, k_lambda=lame,
         k_damp=0.0, add_surface_mesh_edges=False,
-        particle_radius=1e-6,  # else the vertices of a mesh collide with each other,
+        particle_radius=1e-6,  # a larger one makes the vertices of a mesh collide with each other
     )  # fmt: skip
     for vertex in problem.held:
         builder.particle_mass[vertex] = 0.0
@@ -94,7 +94,7 @@ def _method(problem: Problem, device: str, name: str, note: str, lame: float) ->
 
 
 def vbd(problem: Problem, device: str) -> Method:
-    """Vertex Block Descent (Chen et al. 2024), without its optional acceleration, which Newton has not."""
+    """Vertex Block Descent (Chen et al. 2024), without its optional acceleration, which Newton lacks."""
     return _method(problem, device, "Newton VBD", "stable Neo-Hookean, equal to ours for small strain", 0.0)
 
 

@@ -1,4 +1,4 @@
-"""This library: one step with some iterations, or several smaller steps, each with those that "auto" takes."""
+"""This library: one step with n iterations, or n smaller steps, each with the iterations of "auto"."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _compiled(problem: Problem, device: str, time_step: float, solver: Solver | 
 
 
 def step(problem: Problem, device: str, solver: Solver, name: str) -> Method:
-    """One step; n iterations."""
+    """One step with n iterations."""
     sim, state = _compiled(problem, device, problem.time_step, solver)
 
     @torch.no_grad()
@@ -41,7 +41,7 @@ def step(problem: Problem, device: str, solver: Solver, name: str) -> Method:
 
 
 def converged(problem: Problem) -> tuple[Array, float]:
-    """Our converged step in float64, and |grad E| there over that at the start."""
+    """The converged step in float64, and |grad E| there over that at the start."""
     sim = pd.Simulator(problem.scene(), problem.time_step, 400, pd.Multilevel(), torch.float64, progress=False)
     state = sim.rest_state()
     state.velocities[:] = torch.from_numpy(problem.velocities)

@@ -1,4 +1,4 @@
-"""What every simulator is given: a body held at one end and moving, and how far an answer is from a converged one."""
+"""The problem for every simulator: a moving body held at one end, and the error of a result."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ TIME_STEP = 1 / 30  # s
 
 
 class MissingPackageError(RuntimeError):
-    """A simulator that is not installed; says which packages it takes."""
+    """A simulator is not installed; the message names the packages it needs."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Rest shape = start positions, density 1000 kg/m^3, Poisson ratio 0."""
+    """A body whose rest shape is its start, with density 1000 kg/m^3 and Poisson ratio 0."""
 
     name: str
     mesh: pd.TetMesh
@@ -34,7 +34,7 @@ class Problem:
 
     @property
     def first(self) -> Array:
-        """u_0 = h v [m], from which errors are measured."""
+        """u_0 = h v [m], the reference of errors."""
         return self.time_step * self.velocities
 
     def scene(self) -> pd.Scene:
@@ -42,13 +42,13 @@ class Problem:
         return pd.Scene(body, pd.Pin(body, self.held), pd.Gravity((0.0, GRAVITY, 0.0)))
 
     def error(self, displacement: Array, converged: Array) -> float:
-        """|u - u*| / |u_0 - u*|; inf where numbers ran out."""
+        """|u - u*| / |u_0 - u*|; inf after an overflow."""
         found = np.linalg.norm(displacement - converged) / np.linalg.norm(self.first - converged)
         return float(found) if np.isfinite(found) else np.inf
 
 
 def beam(cells: int, youngs: float) -> Problem:
-    """1 x 0.2 x 0.2 m, held at x = 0, thrown downwards with v_y = -10 x^2, as float32 holds it."""
+    """A beam of 1 x 0.2 x 0.2 m, held at x = 0, thrown downwards with v_y = -10 x^2 (rounded to float32)."""
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (5 * cells, cells, cells))
     velocities = np.zeros_like(mesh.vertices)
     velocities[:, 1] = -10.0 * mesh.vertices[:, 0] ** 2
@@ -57,7 +57,7 @@ def beam(cells: int, youngs: float) -> Problem:
 
 
 def from_file(path: str, youngs: float) -> Problem:
-    """A tetrahedral mesh, made a metre long, held where it is low along its longest side, thrown sideways."""
+    """A tetrahedral mesh scaled to one metre, held at the low end of its longest side, thrown sideways."""
     mesh = pd.TetMesh.from_file(path)
     low, high = mesh.bounds
     mesh = mesh.translated(-low).scaled(1.0 / float((high - low).max()))
@@ -77,9 +77,9 @@ def _rounded(array: Array) -> Array:
 
 @dataclass(frozen=True)
 class Method:
-    """A simulator that was given a problem.
+    """A simulator with its problem.
 
-    `run(n)` gives the displacement [V, 3] m after n iterations (or n substeps), `milliseconds(n)` what that takes.
+    `run(n)` returns the displacement [V, 3] m after n iterations (or n substeps), `milliseconds(n)` their time.
     """
 
     name: str

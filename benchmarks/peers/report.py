@@ -17,12 +17,12 @@ COLOURS = {
 
 
 def milliseconds_to(method: Row, goal: float) -> float | None:
-    """Of the fastest measured point within an error; None where there is none."""
+    """Milliseconds of the fastest measured point within an error; None without one."""
     return min((point["milliseconds"] for point in method["points"] if point["error"] <= goal), default=None)
 
 
 def best_of_ours(methods: list[Row], peer: str, goal: float) -> float | None:
-    """Of the solvers here that a peer is compared with, the fastest."""
+    """Milliseconds of the fastest solver of this library among those compared with a peer."""
     kind = OURS[peer]
     own = [m for m in methods if m["method"] == kind or (kind == "torchpd" and m["method"].startswith("torchpd "))]
     found = [time for time in (milliseconds_to(method, goal) for method in own) if time is not None]
@@ -30,12 +30,12 @@ def best_of_ours(methods: list[Row], peer: str, goal: float) -> float | None:
 
 
 def plain(number: float) -> str:
-    """Two digits, without an exponent."""
+    """Format two digits without an exponent."""
     return f"{number:.2g}" if number < 1.0 else f"{number:.1f}" if number < 10.0 else f"{float(f'{number:.2g}'):,.0f}"
 
 
 def cell(methods: list[Row], peer: Row, goal: float) -> str:
-    """Milliseconds of ours and the peer's, and how many times faster ours is; a bound where the peer gave up."""
+    """Milliseconds of this library and the peer, and their ratio; a bound if the peer gave up."""
     own, other = best_of_ours(methods, peer["method"], goal), milliseconds_to(peer, goal)
     if own is None:
         return "neither" if other is None else f"only the other: {plain(other)}"
@@ -49,7 +49,7 @@ def cell(methods: list[Row], peer: Row, goal: float) -> str:
 
 
 def table(rows: list[Row], goals: tuple[float, ...]) -> str:
-    """Rows by problem, stiffness and peer, in Markdown."""
+    """Format rows by problem, stiffness and peer, in Markdown."""
     lines = [
         "| body | Young's modulus | against | its answer from ours | "
         + " | ".join(f"error {g:g}" for g in goals)
@@ -74,7 +74,7 @@ def table(rows: list[Row], goals: tuple[float, ...]) -> str:
 
 
 def draw(rows: list[Row], path: Path) -> None:
-    """A panel a problem and stiffness: own error against milliseconds."""
+    """Draw one panel per problem and stiffness: own error against milliseconds."""
     import matplotlib.pyplot as plt
 
     problems = list(dict.fromkeys(row["problem"] for row in rows))

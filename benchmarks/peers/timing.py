@@ -1,4 +1,4 @@
-"""Times of a call: on one thread of a CPU those of the processor, on a GPU those that the host waits."""
+"""Time a call: processor time on one CPU thread, waiting time of the host on a GPU."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ _LEAST, _SECONDS = 2, 0.3
 
 
 def fastest(work: Callable[[], object], device: str, wait: Callable[[], object] | None = None) -> float:
-    """Milliseconds of the fastest of some runs; the first is not counted when a run is short.
+    """Milliseconds of the fastest of some runs; for short runs the first is not counted.
 
     Args:
-        work: to be timed.
+        work: the call to time.
         device: "cpu" or "cuda".
-        wait: for the device to be done; torch's by default.
+        wait: waits for the device; default: torch's synchronisation.
     """
     if device == "cuda" and wait is None:
         import torch

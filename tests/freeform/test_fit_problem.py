@@ -9,24 +9,24 @@ import torch
 from torchpd.freeform import least_squares as fit_problem
 from torchpd.freeform.least_squares import (
     HeightProblem,
-    QuadricNumbers,
+    QuadricParameters,
     levenberg_marquardt,
     ridge_amplitudes,
     within_radii,
 )
 
 
-def some(count: int = 5, seed: int = 0) -> QuadricNumbers:
+def some(count: int = 5, seed: int = 0) -> QuadricParameters:
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((count, 10))
     rows[:, 0] *= 0.1
     rows[:, 1:4] *= 0.5
     rows[:, 4:7] = -np.log(rng.uniform(0.4, 0.9, (count, 3)))
     rows[:, 7:] *= 0.3
-    return QuadricNumbers(rows, np.full(count, 1.0))
+    return QuadricParameters(rows, np.full(count, 1.0))
 
 
-def problem(numbers: QuadricNumbers, samples: int = 400) -> HeightProblem:
+def problem(numbers: QuadricParameters, samples: int = 400) -> HeightProblem:
     """Heights of these very quadrics, with weights at random."""
     rng = np.random.default_rng(1)
     points = rng.uniform(-1.0, 1.0, (samples, 3))
@@ -57,7 +57,7 @@ def test_radii_are_held_between_bounds_and_nothing_else_changes() -> None:
     rows = some(6).rows
     rows[0, 4:7] += 8.0
     rows[1, 4:7] -= 8.0
-    before = QuadricNumbers(rows, np.array([1.0, 1.0, 2.0, 2.0, 2.0, 2.0]))
+    before = QuadricParameters(rows, np.array([1.0, 1.0, 2.0, 2.0, 2.0, 2.0]))
     after = within_radii(before, 0.2)
     s0, s1 = (np.linalg.svd(fit_problem.triangular(n.rows), compute_uv=False) for n in (before, after))
     np.testing.assert_allclose(s1, np.clip(s0, 1.0 / before.cap[:, None], 1.0 / 0.2), rtol=1e-12)
@@ -77,9 +77,9 @@ def test_amplitudes_are_linear() -> None:
     case = problem(truth)
     flat = truth.rows.copy()
     flat[:, 0] = 0.0
-    exact = ridge_amplitudes(case, QuadricNumbers(flat, truth.cap), ridge=0.0)
+    exact = ridge_amplitudes(case, QuadricParameters(flat, truth.cap), ridge=0.0)
     np.testing.assert_allclose(exact.rows[:, 0], truth.rows[:, 0], rtol=1e-10)
-    held = ridge_amplitudes(case, QuadricNumbers(flat, truth.cap), ridge=1.0)
+    held = ridge_amplitudes(case, QuadricParameters(flat, truth.cap), ridge=1.0)
     assert np.linalg.norm(held.rows[:, 0]) < 0.8 * np.linalg.norm(truth.rows[:, 0])
 
 
@@ -89,7 +89,7 @@ def test_it_comes_back_from_nearby(monkeypatch: pytest.MonkeyPatch, dense: int) 
     monkeypatch.setattr(fit_problem, "_DENSE", dense)
     truth = within_radii(some(), 0.2)
     case = problem(truth, 2000)
-    near = QuadricNumbers(truth.rows + 0.03 * np.random.default_rng(2).standard_normal(truth.rows.shape), truth.cap)
+    near = QuadricParameters(truth.rows + 0.03 * np.random.default_rng(2).standard_normal(truth.rows.shape), truth.cap)
     counted = []
     found = levenberg_marquardt(case, near, iterations=60, least=0.1, report=lambda: counted.append(1))
     np.testing.assert_allclose(found.rows, truth.rows, rtol=0, atol=1e-8)
@@ -101,7 +101,7 @@ def test_no_radius_leaves_its_bounds() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1.0, 1.0, (500, 3))
     case = HeightProblem(points, np.ones(500), np.ones(500))
-    start = QuadricNumbers.spheres(np.zeros((1, 3)), np.array([0.4]), np.array([0.5]))
+    start = QuadricParameters.spheres(np.zeros((1, 3)), np.array([0.4]), np.array([0.5]))
     found = levenberg_marquardt(case, ridge_amplitudes(case, start), iterations=30, least=0.1)
     radii = 1.0 / np.linalg.svd(fit_problem.triangular(found.rows), compute_uv=False)
     assert radii.max() == pytest.approx(0.5, rel=1e-9)

@@ -197,7 +197,7 @@ def on_sphere(friction: float = 0.3) -> Case:
 
 def longest_spread(mesh: TetMesh) -> float:
     """Largest l_e of a mesh."""
-    return float(elements(mesh.vertices, mesh.tets).spread.max())
+    return float(elements(mesh.vertices, mesh.tets).eigenvalue_bound.max())
 
 
 class Still(StepProblem):

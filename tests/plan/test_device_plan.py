@@ -130,7 +130,7 @@ def test_rest_shapes_fit_the_order_of_corners(
 @pytest.mark.parametrize("kernel", [CLUSTER, GRID])
 def test_bounds_are_those_of_the_reference(kernel: int, case: tuple[str, int], values: SceneValues) -> None:
     lanes = Lanes.of(arrays_of(case, kernel))
-    expected = elements(values.rest_positions, values.tets).spread[lanes.tet[lanes.real]]
+    expected = elements(values.rest_positions, values.tets).eigenvalue_bound[lanes.tet[lanes.real]]
     np.testing.assert_allclose(lanes.bound[lanes.real], expected, rtol=1e-9)
 
 

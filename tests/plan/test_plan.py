@@ -103,7 +103,7 @@ def test_lanes_hold_their_elements(plan: Plan, values: SceneValues) -> None:
     real = real_lanes(plan)
     np.testing.assert_allclose(plan.tet_volume.numpy().reshape(-1)[real], shape.volumes[who[real]], rtol=1e-12)
     # l_e is between 4/3 and 4; flat elements lose digits of their unit normals to the condition
-    np.testing.assert_allclose(plan.tet_bound.numpy().reshape(-1)[real], shape.spread[who[real]], rtol=1e-10)
+    np.testing.assert_allclose(plan.tet_bound.numpy().reshape(-1)[real], shape.eigenvalue_bound[who[real]], rtol=1e-10)
     assert bool(plan.tet_bound.isfinite().all())
 
 
@@ -116,7 +116,7 @@ def test_bounds_of_regular_tetrahedra() -> None:
     turn[0] *= np.linalg.det(turn)
     for vertices in [*corners, *(shape @ turn.T for shape in corners)]:
         values = pd.Scene(pd.Solid(pd.TetMesh(vertices, [[0, 1, 2, 3]]), 1e5)).values()
-        expected = elements(values.rest_positions, values.tets).spread[0]
+        expected = elements(values.rest_positions, values.tets).eigenvalue_bound[0]
         bounds = compile_plan(values, dtype=torch.float64).tet_bound.numpy().reshape(-1)
         np.testing.assert_allclose(bounds[0], expected, rtol=1e-13)
 

@@ -113,7 +113,7 @@ def test_regular_tetrahedron_has_closed_form_elements() -> None:
     vertices = np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])
     shape = elements(vertices, np.array([[0, 1, 2, 3]]))
     assert shape.volumes[0] == pytest.approx(8.0 / 3.0, rel=1e-14)
-    assert shape.spread[0] == pytest.approx(4.0 / 3.0, rel=1e-14)  # four unit normals at cosine -1/3
+    assert shape.eigenvalue_bound[0] == pytest.approx(4.0 / 3.0, rel=1e-14)  # four unit normals at cosine -1/3
     np.testing.assert_allclose(shape.shape_gradients[0], vertices / 4.0, atol=1e-15)
 
 

@@ -136,7 +136,8 @@ def refusal(words: list[str], script: str, capsys: pytest.CaptureFixture[str], m
 
 
 def test_unknown_scene_is_refused(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "no scene nothing; there are 1k, 10k" in refusal(["--only", "nothing"], "run.py", capsys, monkeypatch)
+    said = refusal(["--only", "nothing"], "run.py", capsys, monkeypatch)
+    assert all(word in said for word in ("--only", "1k, 10k", "got nothing"))
 
 
 def test_beam_counts_iterations(tmp_path: Path) -> None:
@@ -257,7 +258,7 @@ def test_irregular_bar_is_the_same_in_slabs(monkeypatch: pytest.MonkeyPatch) -> 
     # a sphere that is not seen as a whole may have a point within it
     monkeypatch.setattr(scenes, "_MARGIN", 0.5)
     points = whole.vertices / scenes.SIZE * cells
-    with pytest.raises(RuntimeError, match="a sphere reaches past the margin"):
+    with pytest.raises(RuntimeError, match="_MARGIN"):
         scenes._delaunay_slab(points, 7.25, 14.25)
 
 

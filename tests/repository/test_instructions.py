@@ -65,7 +65,7 @@ def test_a_conditional_way_out_does_not_end_a_loop(tool: dict[str, Any]) -> None
 def test_what_is_missing_is_said() -> None:
     for source, words in (
         ("nothing", "there is no nothing.cu in csrc/"),
-        ("fused_float", "there is no nvcc: set CUDA_HOME"),
+        ("fused_float", "nvcc not found: set CUDA_HOME"),
     ):
         command = [sys.executable, TOOLS / "instructions.py", source]
         result = subprocess.run(command, env={"CUDA_HOME": "/nowhere"}, capture_output=True, text=True, check=False)

@@ -24,7 +24,7 @@ from torchpd.study import axes as study_axes
 from torchpd.study import bench as study_bench
 from torchpd.study.axes import (
     baseline_rows,
-    contender_rows,
+    candidate_rows,
     dense_rows,
     float_rows,
     mesh_rows,
@@ -37,11 +37,11 @@ from torchpd.study.bench import (
     Timing,
     UncertainWarning,
     count_kernels,
+    row_statuses,
     solved_step,
     time_calls,
-    verdicts,
 )
-from torchpd.study.plots import STYLES, draw_study, float32_floor, in_words, pareto_front
+from torchpd.study.plots import STYLES, draw_study, float32_floor, method_label, pareto_front
 from torchpd.study.results_log import Row
 from torchpd.study.scenes import STUDY_SCENES
 
@@ -80,7 +80,7 @@ def test_float32_differs_by_rounding(bench: Bench) -> None:
 
 def test_solvers_and_methods_meet_at_the_converged_step(bench: Bench) -> None:
     setting = Setting(1e5, 1 / 60, 1)
-    (ours,) = contender_rows(bench, "guarded Chebyshev", torch.float64, setting, [300])
+    (ours,) = candidate_rows(bench, "guarded Chebyshev", torch.float64, setting, [300])
     *_, theirs = baseline_rows(bench, "Newton", setting, [30])
     assert max(ours.error, theirs.error) < 1e-9
     assert (ours.compiled, theirs.compiled) == (True, False)
@@ -88,10 +88,10 @@ def test_solvers_and_methods_meet_at_the_converged_step(bench: Bench) -> None:
     assert (ours.bytes_by, theirs.bytes_by) == ("layout", "tracemalloc")
     assert ours.milliseconds_p5 <= ours.milliseconds <= ours.milliseconds_p95
     (same,) = [row for row in baseline_rows(bench, "guarded Chebyshev, NumPy", setting, [8]) if row.iterations == 8]
-    (compiled,) = contender_rows(bench, "guarded Chebyshev", torch.float64, setting, [8])
+    (compiled,) = candidate_rows(bench, "guarded Chebyshev", torch.float64, setting, [8])
     # the same iterates in two languages
     assert same.error == pytest.approx(compiled.error, rel=1e-9)
-    assert (in_words(theirs), in_words(same)) == (
+    assert (method_label(theirs), method_label(same)) == (
         "Newton (float64: C++, Hessian in NumPy, SuperLU)",
         "guarded Chebyshev, NumPy",
     )
@@ -102,7 +102,7 @@ def test_refusals_and_divergence_become_rows() -> None:
     (row,) = baseline_rows(landing, "Newton", Setting(3e4, 1 / 60, 8), [4])
     assert row.status.startswith("refused: scene must have no contacts")
     assert math.isinf(row.error)
-    (plain,) = contender_rows(landing, "Jacobi", torch.float32, Setting(3e4, 1 / 60, 8), [4])
+    (plain,) = candidate_rows(landing, "Jacobi", torch.float32, Setting(3e4, 1 / 60, 8), [4])
     assert plain.status == "ok"
 
 
@@ -191,15 +191,15 @@ def test_float32_levels_off_where_float64_goes_on() -> None:
 
 def test_diverged_is_what_ends_so() -> None:
     """Not the first iterate of a method that descends in energy; and an error that nobody knows is neither."""
-    assert verdicts([3.05, 0.4, 1e-3]) == ["ok", "ok", "ok"]
-    assert verdicts([0.9, 3.0, math.inf]) == ["ok", "diverged", "diverged"]
-    assert verdicts([math.nan, 0.1]) == ["diverged", "ok"]
-    assert verdicts([3.0, 0.4, 1e-3, 1e-12], 0.02) == ["ok", "ok", "uncertain", "uncertain"]
+    assert row_statuses([3.05, 0.4, 1e-3]) == ["ok", "ok", "ok"]
+    assert row_statuses([0.9, 3.0, math.inf]) == ["ok", "diverged", "diverged"]
+    assert row_statuses([math.nan, 0.1]) == ["diverged", "ok"]
+    assert row_statuses([3.0, 0.4, 1e-3, 1e-12], 0.02) == ["ok", "ok", "uncertain", "uncertain"]
     # below what any figure shows
-    assert verdicts([1e-12], 1e-10) == ["ok"]
+    assert row_statuses([1e-12], 1e-10) == ["ok"]
     # the last iterate has less energy than the converged step: they go to another minimum
-    assert verdicts([0.5, math.inf, 0.7], 0.0, [0.3, None, -1e-3]) == ["uncertain", "diverged", "uncertain"]
-    assert verdicts([0.5, 1e-9], 0.0, [0.3, -1e-15]) == ["ok", "ok"]
+    assert row_statuses([0.5, math.inf, 0.7], 0.0, [0.3, None, -1e-3]) == ["uncertain", "diverged", "uncertain"]
+    assert row_statuses([0.5, 1e-9], 0.0, [0.3, -1e-15]) == ["ok", "ok"]
 
 
 def test_a_stiff_beam_is_compared_with_its_converged_step() -> None:
@@ -207,7 +207,7 @@ def test_a_stiff_beam_is_compared_with_its_converged_step() -> None:
     bench, setting = Bench(STUDY_SCENES["beam"](), CPU, series=1, seconds=0.0), Setting(1e8, 1 / 30, 8)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UncertainWarning)
-        rows = contender_rows(bench, "Multilevel", torch.float64, setting, [1, 16, 64])
+        rows = candidate_rows(bench, "Multilevel", torch.float64, setting, [1, 16, 64])
     assert [row.status for row in rows] == ["ok"] * 3
     assert rows[-1].error < 1e-6
     assert study_table(rows).splitlines()[1].count("16 it.") >= 2

@@ -66,16 +66,16 @@ class CompiledStep(CountedStep):
         self.calls[0] += 1
         return self._gradient(displacement)
 
-    def _places(self, displacement: Array) -> Tensor:
+    def _positions_tensor(self, displacement: Array) -> Tensor:
         return torch.from_numpy(self.positions + displacement)[None]
 
     def _energy(self, displacement: Array) -> float:
         pull = displacement - self.target
-        elastic = float(_ops.element_energy(self._places(displacement), *self._elements).sum())
+        elastic = float(_ops.element_energy(self._positions_tensor(displacement), *self._elements).sum())
         return 0.5 * float(np.vdot(self._quadratic * pull, pull)) + elastic
 
     def _gradient(self, displacement: Array) -> Array:
-        gradient: Array = _ops.gradient(self._places(displacement), *self._elements)[0].numpy()
+        gradient: Array = _ops.gradient(self._positions_tensor(displacement), *self._elements)[0].numpy()
         gradient += self._quadratic * (displacement - self.target)
         gradient[self._held] = 0.0
         return gradient

@@ -31,20 +31,20 @@ _LEVEL = 1e-12  # relative difference of energies below which it is rounding
 
 
 @dataclass(frozen=True)
-class _Touching:
+class _ActiveContacts:
     """Active contacts of a displacement, which leave n free directions."""
 
     gradient: Array  # [V, 3] N
-    landing: Array  # [V, 3] m: displacement of touching vertices onto their surfaces
+    normal_step: Array  # [V, 3] m: displacement of touching vertices onto their surfaces
     tangents: csr_array  # [3 V, n], orthonormal
-    bending: Array  # [V] N/m: force of a sphere over its radius; its curvature softens the tangents by as much
+    sphere_stiffness: Array  # [V] N/m: force of a sphere over its radius, by which its curvature softens the tangents
 
     def project(self, vectors: Array) -> Array:
         """Project vectors [V, 3] onto the free directions."""
         return np.asarray(self.tangents @ (self.tangents.T @ vectors.reshape(-1))).reshape(-1, 3)
 
 
-def _touching(problem: StepProblem, displacement: Array) -> _Touching:
+def _active_contacts(problem: StepProblem, displacement: Array) -> _ActiveContacts:
     gradient, diagonal = problem.gradient(displacement), problem.weighted_diagonal
     places, count = problem.positions + displacement, len(problem.positions)
     stepped = places - gradient / diagonal[:, None]
@@ -61,12 +61,12 @@ def _touching(problem: StepProblem, displacement: Array) -> _Touching:
         normals[len(planes) + k] = outwards = arms / radii[k][:, None]
         gaps[len(planes) + k] = radii[k] - sphere[SPHERES["radius"]]
         depths[len(planes) + k] = sphere[SPHERES["radius"]] - ((stepped - center) * outwards).sum(axis=1)
-    pushes = _pushes(normals, depths) * problem.free
-    bending = (diagonal * pushes[len(planes) :] / radii).sum(axis=0)
-    return _Touching(gradient, *_tangents(pushes > 0.0, normals, gaps, problem.free), bending)
+    pushes = _contact_displacements(normals, depths) * problem.free
+    sphere_stiffness = (diagonal * pushes[len(planes) :] / radii).sum(axis=0)
+    return _ActiveContacts(gradient, *_tangents(pushes > 0.0, normals, gaps, problem.free), sphere_stiffness)
 
 
-def _pushes(normals: Array, depths: Array) -> Array:
+def _contact_displacements(normals: Array, depths: Array) -> Array:
     """Least displacement [C, V] m by which each contact moves each vertex out of all contacts (Hildreth).
 
     A contact is inactive (0) for a vertex that other contacts already keep outside it.
@@ -81,12 +81,12 @@ def _pushes(normals: Array, depths: Array) -> Array:
 
 def _tangents(held: Mask, normals: Array, gaps: Array, free: Mask) -> tuple[Array, csr_array]:
     """Displacements [V, 3] m of held vertices onto their surfaces, and the free directions of all vertices."""
-    landing = np.zeros((len(free), 3))
+    normal_step = np.zeros((len(free), 3))
     rows, entries = [], []
     for vertex in np.flatnonzero(held.any(axis=0)):
         own = np.flatnonzero(held[:, vertex])
         across = normals[own, vertex]
-        landing[vertex] = -np.linalg.pinv(across) @ gaps[own, vertex]
+        normal_step[vertex] = -np.linalg.pinv(across) @ gaps[own, vertex]
         _, sizes, axes = np.linalg.svd(across)
         for tangent in axes[int((sizes > 1e-9).sum()) :]:
             rows.append(3 * vertex + np.arange(3))
@@ -95,7 +95,7 @@ def _tangents(held: Mask, normals: Array, gaps: Array, free: Mask) -> tuple[Arra
     columns = np.concatenate([np.repeat(np.arange(len(rows)), 3), len(rows) + np.arange(len(loose))])
     values = np.concatenate([*entries, np.ones(len(loose))])
     shape = (3 * len(free), len(rows) + len(loose))
-    return landing, csr_array((values, (np.concatenate([*rows, loose]), columns)), shape=shape)
+    return normal_step, csr_array((values, (np.concatenate([*rows, loose]), columns)), shape=shape)
 
 
 class ContactNewton:
@@ -115,28 +115,29 @@ class ContactNewton:
 
         Returns the step and True. With False the step only descends: there is no minimum, or it was not reached.
         """
-        found = _touching(self.problem, displacement)
+        found = _active_contacts(self.problem, displacement)
         here = torch.from_numpy(displacement)
 
         def multiply(p: Array) -> Array:
-            return np.asarray(self.krylov.product(here, torch.from_numpy(p)).numpy() - found.bending[:, None] * p)
+            image = self.krylov.product(here, torch.from_numpy(p)).numpy()
+            return np.asarray(image - found.sphere_stiffness[:, None] * p)
 
-        residual = -found.project(found.gradient + multiply(found.landing))
+        residual = -found.project(found.gradient + multiply(found.normal_step))
         goal = _LINEAR * float(np.linalg.norm(residual))
-        way, search, rho = np.zeros_like(residual), residual, 0.0
+        step, search, rho = np.zeros_like(residual), residual, 0.0
         for inner in range(_INNER):
             if float(np.linalg.norm(residual)) <= goal:
-                return found.landing + way, True
+                return found.normal_step + step, True
             smooth = found.project(self.krylov.precondition(torch.from_numpy(residual)).numpy())
             last, rho = rho, float((residual * smooth).sum())
             search = smooth + (rho / last) * search if inner else smooth
             image = found.project(multiply(search))
             curvature = float((search * image).sum())
             if curvature <= 0.0:
-                return found.landing + (way if inner else search), False
-            way = way + (rho / curvature) * search
+                return found.normal_step + (step if inner else search), False
+            step = step + (rho / curvature) * search
             residual = residual - (rho / curvature) * image
-        return found.landing + way, False
+        return found.normal_step + step, False
 
     def minimise(self, displacement: Array, *, iterations: int = 50, observe: Observer | None = None) -> Array:
         """Take steps from u [V, 3] m while the energy falls, or the residual once energies differ only by rounding."""
@@ -151,11 +152,11 @@ class ContactNewton:
                 observe(k + 1, u)
         return u
 
-    def _descend(self, u: Array, energy: float, size: float, way: Array) -> tuple[Array, float, float] | None:
-        """Backtrack along `way`; None if no step descends."""
+    def _descend(self, u: Array, energy: float, size: float, step: Array) -> tuple[Array, float, float] | None:
+        """Backtrack along `step`; None if no step descends."""
         length = 1.0
         while length >= _SHORTEST:
-            trial = self.problem.project(u + length * way)
+            trial = self.problem.project(u + length * step)
             reached, left = self.problem.energy(trial), float(np.linalg.norm(self.problem.residual(trial)))
             level = abs(reached - energy) <= _LEVEL * abs(energy)
             if left < 0.9 * size if level else reached < energy:

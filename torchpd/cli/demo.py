@@ -83,7 +83,7 @@ def run_demo(options: DemoOptions) -> str:
     check_packages()
     device = find_device(options.device)
     name = options.mesh.name if options.mesh else "octopus"
-    mesh = _place(_load(options.mesh), options.cells)
+    mesh = _place_body(_load(options.mesh), options.cells)
     scene = Scene(Solid(mesh, youngs=options.youngs, density=1000.0), Gravity(), Ground(friction=0.5))
     sim = Simulator(scene, TIME_STEP, iterations=options.iterations, batch=1).to(device)
     options.out.mkdir(parents=True, exist_ok=True)
@@ -110,7 +110,7 @@ def _load(path: Path | None) -> TetMesh | TriMesh:
     return TetMesh.from_file(path) if holds_body("demo", path) else TriMesh.from_file(path)
 
 
-def _place(shape: TetMesh | TriMesh, cells: int) -> TetMesh:
+def _place_body(shape: TetMesh | TriMesh, cells: int) -> TetMesh:
     """Scale to one metre, tilt so that the body lands on an edge and bends, and lift it above the ground."""
     low, high = shape.bounds
     # about z, then x, then y (towards the camera)

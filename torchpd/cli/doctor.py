@@ -87,7 +87,7 @@ def _cuda_state(build: Mapping[str, Any] | None, toolkit: Toolkit) -> str:
     return f"not built: {toolkit.reason}"
 
 
-def _call_wrongly() -> subprocess.CompletedProcess[str]:
+def _run_wrong_call() -> subprocess.CompletedProcess[str]:
     """Run a process that calls an op with a wrong argument."""
     paths = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
@@ -97,7 +97,7 @@ def _call_wrongly() -> subprocess.CompletedProcess[str]:
 
 def _problem_of_errors() -> str:
     """The reason why an op's error does not arrive as a Python exception; empty if it does."""
-    run = _call_wrongly()
+    run = _run_wrong_call()
     said = run.stdout.strip()
     if run.returncode == 0 and said.endswith(_END_OF_ERROR):
         return ""

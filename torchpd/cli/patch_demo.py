@@ -121,12 +121,12 @@ def _body(mesh: TriMesh, quadrics: Quadrics, device: torch.device, stiffness: fl
     return PatchBody(patches, stiffness, **options)  # type: ignore[arg-type]
 
 
-def _turns(angle: float, axis: int) -> Array:
+def _rotation(angle: float, axis: int) -> Array:
     """The rotation by an angle about an axis."""
     return np.asarray(Rotation.from_rotvec(angle * np.eye(3)[axis]).as_matrix())
 
 
-def _share(step: int, steps: int) -> float:
+def _progress(step: int, steps: int) -> float:
     """Fraction of the motion: 0 to 1 over the first three quarters of the steps, then 1."""
     return min(1.0, (step + 1) / (0.75 * steps))
 
@@ -145,7 +145,7 @@ def _twist(quadrics: int, stiffness: float, steps: int, device: torch.device) ->
     middle = np.array([0.0, 0.35, 0.0])
 
     def targets(step: int) -> dict[Pin, Tensor]:
-        moved = (rest - middle) @ _turns(np.pi * _share(step, steps), 0).T + middle
+        moved = (rest - middle) @ _rotation(np.pi * _progress(step, steps), 0).T + middle
         return {grip: torch.tensor(moved, dtype=torch.float32, device=device)}
 
     return PreparedScene(body, Scene(body, wall, grip, Damping(2.0)), targets)
@@ -160,9 +160,9 @@ def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> 
     wall, (grip, rest) = Pin(body, x < 0.05), _held(body, x > length - 0.05)
 
     def targets(step: int) -> dict[Pin, Tensor]:
-        angle = most * _share(step, steps)
+        angle = most * _progress(step, steps)
         end = length / angle * np.array([np.sin(angle), 1.0 - np.cos(angle), 0.0])
-        moved = (rest - [length, 0.0, 0.0]) @ _turns(angle, 2).T + end
+        moved = (rest - [length, 0.0, 0.0]) @ _rotation(angle, 2).T + end
         return {grip: torch.tensor(moved, dtype=torch.float32, device=device)}
 
     return PreparedScene(body, Scene(body, wall, grip, Damping(2.0)), targets)
@@ -170,7 +170,9 @@ def _bend(quadrics: int, stiffness: float, steps: int, device: torch.device) -> 
 
 def _drop(quadrics: int, stiffness: float, _steps: int, device: torch.device) -> PreparedScene:
     """A ball that falls on the ground, with a fifth of the others' stiffness."""
-    mesh = spindle(10, 10, length=0.6, radius=0.3, power=2.0).transformed(_turns(0.9, 2)).translated((0.0, 0.75, 0.0))
+    mesh = (
+        spindle(10, 10, length=0.6, radius=0.3, power=2.0).transformed(_rotation(0.9, 2)).translated((0.0, 0.75, 0.0))
+    )
     body = _body(mesh, scattered(mesh, quadrics, height=0.25, seed=3), device, 0.2 * stiffness)
     return PreparedScene(body, Scene(body, Gravity(), Ground(friction=0.5)), None)
 
@@ -202,9 +204,9 @@ def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, lev
     sim = Simulator(prepared.scene, TIME_STEP, options.iterations, batch=1).to(device)
     start = sim.rest_state()
     sim.rollout(start, 2, targets=prepared.targets)  # the first steps also allocate their workspace
-    begin = _now(device)
+    begin = _synchronised_time(device)
     track = sim.rollout(start, options.steps, targets=prepared.targets, return_info=True, progress=True)
-    simulated = _now(device) - begin
+    simulated = _synchronised_time(device) - begin
     positions = torch.cat([start.positions[None], track.positions])
     if not bool(positions.isfinite().all()):
         raise ValueError("positions must stay finite, got inf or NaN in the motion; try a larger --youngs")
@@ -212,9 +214,9 @@ def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, lev
     with torch.no_grad():
         heights = body.patches.heights(grid.samples)  # constant in the material
         body.patches.surface(grid.samples, body.pose(positions[0]), heights=heights)
-        begin = _now(device)
+        begin = _synchronised_time(device)
         frames = [body.patches.surface(grid.samples, body.pose(x), heights=heights).points for x in positions]
-        surfaced = _now(device) - begin
+        surfaced = _synchronised_time(device) - begin
         continuity = measure_continuity(body.patches), measure_continuity(body.patches, body.pose(positions[-1]))
     return _Run(
         scene,
@@ -227,7 +229,7 @@ def _simulate(scene: PatchScene, options: DemoOptions, device: torch.device, lev
     )
 
 
-def _now(device: torch.device) -> float:
+def _synchronised_time(device: torch.device) -> float:
     """Time [s] after the device has finished its work."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)

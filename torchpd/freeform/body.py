@@ -158,11 +158,11 @@ class _Layer:
         self.around = torch.as_tensor(around, device=triangles.device)
 
     def __call__(self, positions: Tensor) -> Tensor:
-        middles: Tensor = _Middles.apply(positions, self.triangles, self.around)  # type: ignore[no-untyped-call]
-        return middles
+        centroids: Tensor = _Centroids.apply(positions, self.triangles, self.around)  # type: ignore[no-untyped-call]
+        return centroids
 
 
-class _Middles(torch.autograd.Function):
+class _Centroids(torch.autograd.Function):
     """Means over the corners of triangles: [B, V, 3] to [B, P, 3]."""
 
     generate_vmap_rule = True

@@ -120,8 +120,8 @@ def _refuse_flat(points: Array, tets: Index, patch: Index, fix: str) -> None:
     bad = np.flatnonzero(~(size >= least) | ~(_flatness(points, tets) > LEAST_VOLUME))
     if len(bad):
         raise ValueError(
-            f"PatchBody.patches: constraints must have at least {LEAST_VOLUME:g} of their mean volume, that is "
-            f"{least:.3g} m^3, and not be flat, got {size[bad[0]]:.3g} m^3 under patch {int(patch[bad[0]])} "
+            f"PatchBody.patches: constraints must have at least {LEAST_VOLUME:g} of their mean volume "
+            f"({least:.3g} m^3) and not be flat, got {size[bad[0]]:.3g} m^3 under patch {int(patch[bad[0]])} "
             f"({len(bad)} in all); {fix}"
         )
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from .fit_samples import FitSamples, inner_points, mean_edges, sample_target
-from .least_squares import HeightProblem, QuadricNumbers, levenberg_marquardt, ridge_amplitudes
+from .least_squares import HeightProblem, QuadricParameters, levenberg_marquardt, ridge_amplitudes
 from .loss import PatchLoss, descend
 from .surface import PatchSurface
 from .targets import FitTarget
@@ -98,7 +98,7 @@ class _Stages:
         self.cap = cap * edges[samples.places.patch.numpy()]  # at each sample
         self.least = _LEAST_RADIUS * float(edges.mean()) / level
 
-    def seed(self, count: int, residual: Array) -> QuadricNumbers:
+    def seed(self, count: int, residual: Array) -> QuadricParameters:
         """Spheres around samples with a large residual and far from each other."""
         points = self.samples.points
         weight = np.abs(residual) + 1e-3 * np.abs(residual).max(initial=0.0)
@@ -109,9 +109,9 @@ class _Stages:
             chosen.append(place)
             apart = np.minimum(apart, np.linalg.norm(points - points[place], axis=1))
         cap = np.maximum(self.cap[chosen], 1.01 * self.least)
-        return QuadricNumbers.spheres(points[chosen], 0.8 * cap, cap)
+        return QuadricParameters.spheres(points[chosen], 0.8 * cap, cap)
 
-    def solve(self, count: int, iterations: int, report: Bar) -> QuadricNumbers:
+    def solve(self, count: int, iterations: int, report: Bar) -> QuadricParameters:
         """Levenberg-Marquardt in two stages, repeated while some quadrics have no effect."""
         numbers = self.grow(None, count - count // 2, iterations, report)
         if count > 1:
@@ -126,17 +126,17 @@ class _Stages:
             numbers = better
         return numbers.chosen(self.contributing(numbers))
 
-    def grow(self, numbers: QuadricNumbers | None, more: int, iterations: int, report: Bar) -> QuadricNumbers:
+    def grow(self, numbers: QuadricParameters | None, more: int, iterations: int, report: Bar) -> QuadricParameters:
         rows = np.empty((0, 10)) if numbers is None else numbers.rows
         fresh = self.seed(more, self.problem.residuals(rows))
         numbers = fresh if numbers is None else numbers.joined(fresh)
         numbers = ridge_amplitudes(self.problem, numbers)
         return levenberg_marquardt(self.problem, numbers, iterations=iterations, least=self.least, report=report)
 
-    def cost(self, numbers: QuadricNumbers) -> float:
+    def cost(self, numbers: QuadricParameters) -> float:
         return float((self.problem.residuals(numbers.rows) ** 2).sum())
 
-    def contributing(self, numbers: QuadricNumbers) -> NDArray[np.bool_]:
+    def contributing(self, numbers: QuadricParameters) -> NDArray[np.bool_]:
         basis = self.problem.basis(numbers.rows)
         share = numbers.rows[:, 0] ** 2 * np.asarray(basis.power(2).sum(axis=0)).reshape(-1)
         whole = float(((self.problem.root * self.problem.heights) ** 2).sum())

@@ -57,8 +57,8 @@ def sample_target(empty: PatchSurface, target: FitTarget, level: int) -> FitSamp
     if np.mean(~found) > _MISSED:
         first = int(np.flatnonzero(~found)[0])
         raise ValueError(
-            "FreeFormPatches.fit: target must be a height over the base, along the directors, got none or one "
-            f"that faces away at {int(np.sum(~found))} of {len(found)} samples, first on patch {patch[first]} near "
+            "FreeFormPatches.fit: target must be a height over the base, along the directors, got none or a surface "
+            f"facing away at {int(np.sum(~found))} of {len(found)} samples. The first is on patch {patch[first]} near "
             f"{points[first].round(4).tolist()}: it folds there; use more patches, or pass a base that follows it"
         )
     triangles = grid_on.triangles.numpy()

@@ -1,7 +1,7 @@
 """Least-squares fit of heights at samples in the ten parameters of each quadric, by Levenberg-Marquardt.
 
 On a fixed base the heights depend only on the positions of the samples: h(x) = sum_i R_i(x). Each sample lies in a few
-quadrics, so the Jacobian is sparse. SciPy's least_squares has no bounds for the radii: on the octopus it takes 5 to 60
+quadrics, so the Jacobian is sparse. SciPy's least_squares has no bounds for the radii. On the octopus it takes 5 to 60
 times as long, and its result is 4 times worse once the bounds are applied.
 """
 
@@ -20,7 +20,14 @@ from scipy.spatial import cKDTree
 
 from .quadrics import Quadrics
 
-__all__ = ["HeightProblem", "QuadricNumbers", "levenberg_marquardt", "ridge_amplitudes", "triangular", "within_radii"]
+__all__ = [
+    "HeightProblem",
+    "QuadricParameters",
+    "levenberg_marquardt",
+    "ridge_amplitudes",
+    "triangular",
+    "within_radii",
+]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -30,24 +37,24 @@ _ROWS, _COLUMNS = np.array([0, 1, 2, 1, 2, 2]), np.array([0, 1, 2, 0, 0, 1])  # 
 
 
 @dataclass(frozen=True)
-class QuadricNumbers:
+class QuadricParameters:
     """Parameters of quadrics in rows [Q, 10]: a, c, and the six `Quadrics.factors`; and their largest radii [Q] [m]."""
 
     rows: Array
     cap: Array
 
-    def chosen(self, keep: Index | NDArray[np.bool_]) -> QuadricNumbers:
-        return QuadricNumbers(self.rows[keep], self.cap[keep])
+    def chosen(self, keep: Index | NDArray[np.bool_]) -> QuadricParameters:
+        return QuadricParameters(self.rows[keep], self.cap[keep])
 
-    def joined(self, other: QuadricNumbers) -> QuadricNumbers:
-        return QuadricNumbers(np.concatenate([self.rows, other.rows]), np.concatenate([self.cap, other.cap]))
+    def joined(self, other: QuadricParameters) -> QuadricParameters:
+        return QuadricParameters(np.concatenate([self.rows, other.rows]), np.concatenate([self.cap, other.cap]))
 
     def quadrics(self) -> Quadrics:
         rows = torch.tensor(self.rows)
         return Quadrics(rows[:, 0].clone(), rows[:, 1:4].clone(), rows[:, 4:].clone())
 
     @classmethod
-    def spheres(cls, centres: Array, radii: Array, cap: Array) -> QuadricNumbers:
+    def spheres(cls, centres: Array, radii: Array, cap: Array) -> QuadricParameters:
         """Spheres with amplitude 0."""
         rows = np.zeros((len(centres), 10))
         rows[:, 1:4] = centres
@@ -62,7 +69,7 @@ def triangular(rows: Array) -> Array:
     return m
 
 
-def within_radii(numbers: QuadricNumbers, least: float) -> QuadricNumbers:
+def within_radii(numbers: QuadricParameters, least: float) -> QuadricParameters:
     """The same quadrics with their half axes clamped to [least, cap]."""
     U, s, Vt = np.linalg.svd(triangular(numbers.rows))
     inside = np.clip(s, 1.0 / numbers.cap[:, None], 1.0 / least)
@@ -77,7 +84,7 @@ def within_radii(numbers: QuadricNumbers, least: float) -> QuadricNumbers:
     rows = numbers.rows.copy()
     rows[changed, 4:7] = np.log(np.diagonal(lower, axis1=1, axis2=2))
     rows[changed, 7:10] = lower[:, _ROWS[3:], _COLUMNS[3:]]
-    return QuadricNumbers(rows, numbers.cap)
+    return QuadricParameters(rows, numbers.cap)
 
 
 @dataclass(frozen=True)
@@ -147,14 +154,14 @@ class HeightProblem:
         return self.residuals(rows, pairs), J
 
 
-def ridge_amplitudes(problem: HeightProblem, numbers: QuadricNumbers, ridge: float = 1e-4) -> QuadricNumbers:
+def ridge_amplitudes(problem: HeightProblem, numbers: QuadricParameters, ridge: float = 1e-4) -> QuadricParameters:
     """The same ellipsoids with the best amplitudes, regularised by `ridge` times the mean of the diagonal."""
     A = problem.basis(numbers.rows)
     gram = (A.T @ A).toarray()
     gram[np.diag_indices_from(gram)] += ridge * max(np.trace(gram) / max(len(gram), 1), np.finfo(np.float64).tiny)
     rows = numbers.rows.copy()
     rows[:, 0] = np.linalg.solve(gram, A.T @ (problem.root * problem.heights))
-    return QuadricNumbers(rows, numbers.cap)
+    return QuadricParameters(rows, numbers.cap)
 
 
 def _normal_matrix(J: csr_array) -> Array | csc_array:
@@ -189,12 +196,12 @@ def _damped_step(H: Array | csc_array, gradient: Array, damping: Array) -> Array
 
 def levenberg_marquardt(
     problem: HeightProblem,
-    numbers: QuadricNumbers,
+    numbers: QuadricParameters,
     *,
     iterations: int,
     least: float,
     report: Callable[[], object] = lambda: None,
-) -> QuadricNumbers:
+) -> QuadricParameters:
     """Improve quadrics to a smaller sum of squares; each step stays within the radii.
 
     Marquardt's scaling by the diagonal, Nielsen's rule for the damping (1999). Ends early when eight iterations gain
@@ -223,7 +230,7 @@ def levenberg_marquardt(
             damping, growth = damping * growth, 2.0 * growth
             continue
         limited = np.clip(step.reshape(-1, 10), -_most(numbers), _most(numbers))
-        trial = within_radii(QuadricNumbers(numbers.rows - limited, numbers.cap), least)
+        trial = within_radii(QuadricParameters(numbers.rows - limited, numbers.cap), least)
         new = float((problem.residuals(trial.rows) ** 2).sum())
         if new < cost:
             promised = float(step @ (damping * scale * step + gradient))
@@ -240,7 +247,7 @@ def levenberg_marquardt(
     return numbers
 
 
-def _most(numbers: QuadricNumbers) -> Array:
+def _most(numbers: QuadricParameters) -> Array:
     """The longest step of each number: amplitudes freely, centres by half a cap, factors by a factor of e."""
     most = np.full_like(numbers.rows, np.inf)
     most[:, 1:4] = 0.5 * numbers.cap[:, None]

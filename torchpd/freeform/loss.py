@@ -11,7 +11,7 @@ from tqdm.auto import tqdm
 
 from ..common.checks import check_scalar, check_whole
 from .fit_samples import FitSamples, edge_pairs, mean_edges, sample_target
-from .least_squares import QuadricNumbers, within_radii
+from .least_squares import QuadricParameters, within_radii
 from .quadrics import Quadrics
 from .surface import PatchSamples, PatchSurface
 from .targets import target_of
@@ -123,12 +123,12 @@ def _moved(patches: PatchSurface, patch: Tensor, barycentrics: Tensor) -> PatchS
 def descend(
     loss: PatchLoss,
     patches: PatchSurface,
-    numbers: QuadricNumbers,
+    numbers: QuadricParameters,
     *,
     iterations: int,
     least: float,
     progress: bool = False,
-) -> QuadricNumbers:
+) -> QuadricParameters:
     """Adam with a learning rate that decays to zero; each radius stays between `least` and its cap [m]."""
     parts = [torch.tensor(part, requires_grad=True) for part in np.split(numbers.rows, [1, 4], axis=1)]
     rates = (0.02 * loss.length * 0.1, 0.02 * loss.length, 0.02)
@@ -150,10 +150,10 @@ def descend(
     return _within(parts, slanted, numbers, least)
 
 
-def _within(parts: list[Tensor], slanted: Tensor, numbers: QuadricNumbers, least: float) -> QuadricNumbers:
+def _within(parts: list[Tensor], slanted: Tensor, numbers: QuadricParameters, least: float) -> QuadricParameters:
     """Clamp the radii of the parameters to their bounds, in place."""
     with torch.no_grad():
         rows = torch.cat([parts[0], parts[1], parts[2] * slanted], dim=1).numpy()
-        kept = within_radii(QuadricNumbers(rows, numbers.cap), least)
+        kept = within_radii(QuadricParameters(rows, numbers.cap), least)
         parts[2].copy_(torch.tensor(kept.rows[:, 4:]) / slanted)
     return kept

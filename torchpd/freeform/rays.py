@@ -267,24 +267,24 @@ def _cells(patches: PatchSurface, level: int) -> tuple[Any, Any, Any]:
     )
     b = steps[triangles] / level
     rest = patches.vertices.detach().cpu().double().numpy()[elements]
-    middles = np.einsum("tkc,pcx->ptx", b, rest).reshape(-1, 3) / 3.0
-    return cells[_tree_order(middles, 2)], inner[3:] / _CHECKS, b.reshape(count, 9)
+    centroids = np.einsum("tkc,pcx->ptx", b, rest).reshape(-1, 3) / 3.0
+    return cells[_tree_order(centroids, 2)], inner[3:] / _CHECKS, b.reshape(count, 9)
 
 
-def _tree_order(middles: Any, per_leaf: int) -> Any:
+def _tree_order(centroids: Any, per_leaf: int) -> Any:
     """The order of the leaves: halved at the median of the longest extent, recursively.
 
     The halves are those of the complete tree in csrc/freeform/box_tree.h: leaf l of 2^L starts at l C / 2^L, and each
     has at least `per_leaf` items.
     """
-    count = len(middles)
+    count = len(centroids)
     order = np.arange(count)
     parts = 1
     while 2 * per_leaf * parts <= count:
         start = np.arange(parts + 1) * count // parts
         part = np.repeat(np.arange(parts), np.diff(start))
-        low, high = (f.reduceat(middles[order], start[:-1], axis=0) for f in (np.minimum, np.maximum))
-        along = middles[order, np.argmax(high - low, axis=1)[part]]
+        low, high = (f.reduceat(centroids[order], start[:-1], axis=0) for f in (np.minimum, np.maximum))
+        along = centroids[order, np.argmax(high - low, axis=1)[part]]
         order = order[np.lexsort((order, along, part))]
         parts *= 2
     return order

@@ -381,8 +381,7 @@ def _check_unique(pairs: TouchingPairs) -> None:
     bad = np.flatnonzero(~(pairs.steepness < 1.0))
     if len(bad):
         raise ValueError(
-            "FreeFormPatches: with measured_at='surface' the heights of a patch must be unique, that is the quadrics "
-            f"must rise along its directors by less than 1 m per m, got up to {pairs.steepness[bad[0]]:.3g} on patch "
-            f"{bad[0]} ({len(bad)} in all): it may fold over; lower or widen its quadrics, move their centres towards "
-            "the base, or pass measured_at='base'"
+            "FreeFormPatches.quadrics must rise along the directors by less than 1 m per m with measured_at='surface', "
+            f"got up to {pairs.steepness[bad[0]]:.3g} on patch {bad[0]} ({len(bad)} in all). The patch may fold over: "
+            "lower or widen its quadrics, move their centres towards the base, or pass measured_at='base'"
         )

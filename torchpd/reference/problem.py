@@ -52,7 +52,7 @@ class Elements:
     rest_inverse: Array  # [E, 3, 3] Dm^-1, the columns of Dm being the edges x_1 - x_0, x_2 - x_0, x_3 - x_0 [1/m]
     volumes: Array  # [E] m^3
     shape_gradients: Array  # [E, 4, 3] grad N_a [1/m]
-    spread: Array  # [E] l_e = lambda_max(diag(K)^-1/2 K diag(K)^-1/2), K = grad N grad N^T, between 4/3 and 4
+    eigenvalue_bound: Array  # [E] l_e = lambda_max(diag(K)^-1/2 K diag(K)^-1/2), K = grad N grad N^T, between 4/3 and 4
 
 
 def elements(rest_positions: Array, tets: Index) -> Elements:
@@ -62,8 +62,8 @@ def elements(rest_positions: Array, tets: Index) -> Elements:
     rest_inverse = np.linalg.inv(edges)
     gradients = np.concatenate([-rest_inverse.sum(axis=1, keepdims=True), rest_inverse], axis=1)
     directions = gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
-    spread = np.linalg.eigvalsh(directions @ np.swapaxes(directions, 1, 2))[:, -1]
-    return Elements(np.asarray(rest_inverse, np.float64), np.linalg.det(edges) / 6.0, gradients, spread)
+    eigenvalue_bound = np.linalg.eigvalsh(directions @ np.swapaxes(directions, 1, 2))[:, -1]
+    return Elements(np.asarray(rest_inverse, np.float64), np.linalg.det(edges) / 6.0, gradients, eigenvalue_bound)
 
 
 def gradient_operator(shape_gradients: Array, tets: Index, count: int) -> csr_array:
@@ -178,7 +178,7 @@ class StepProblem:
     @cached_property
     def weighted_diagonal(self) -> Array:
         """Dbar_i = a_i + sum_e l_e w_e V_e |grad N_i|^2 [V], N/m: A <= Dbar on every mesh."""
-        return self._diagonal(self.geometry.spread)
+        return self._diagonal(self.geometry.eigenvalue_bound)
 
     @cached_property
     def matrix(self) -> csr_array:

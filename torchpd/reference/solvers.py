@@ -127,8 +127,8 @@ def _iterate(
         if observe is not None:
             observe(k + 1, current)
         if tolerance > 0.0:
-            left = _error_left(float(np.linalg.norm(current - previous)), left, slowest, omega)
-            if left <= tolerance * _way(problem, previous):
+            left = _estimate_error(float(np.linalg.norm(current - previous)), left, slowest, omega)
+            if left <= tolerance * _displacement_scale(problem, previous):
                 result.converged = True
                 break
     result.displacement = problem.align(current)
@@ -136,7 +136,7 @@ def _iterate(
     return result
 
 
-def _error_left(change: float, before: float, slowest: float, omega: float) -> float:
+def _estimate_error(change: float, before: float, slowest: float, omega: float) -> float:
     """Estimate |u - u*| [m] from the change of an iteration of weight omega and the previous estimate.
 
     A Jacobi iteration damps the slowest mode by g = `slowest`. An iteration of weight omega damps it by |r|, with r the
@@ -151,7 +151,7 @@ def _error_left(change: float, before: float, slowest: float, omega: float) -> f
     return max(change / (1.0 - kept), kept * before)
 
 
-def _way(problem: StepProblem, displacement: Array) -> float:
+def _displacement_scale(problem: StepProblem, displacement: Array) -> float:
     """Scale of the relative error [m]: displacement by elasticity and contacts, or by gravity if larger."""
     fall = problem.time_step**2 * float(np.linalg.norm(problem.values.gravity)) * math.sqrt(len(displacement))
     return max(float(np.linalg.norm(displacement - problem.target)), fall)

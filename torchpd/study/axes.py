@@ -26,16 +26,16 @@ from .bench import (
     clock_of,
     measure_step,
     precision_name,
+    row_statuses,
     solved_step,
     time_calls,
-    verdicts,
 )
 from .results_log import Row
 
 __all__ = [
     "PAPER_TESTS",
     "baseline_rows",
-    "contender_rows",
+    "candidate_rows",
     "dense_rows",
     "float_rows",
     "mesh_rows",
@@ -62,7 +62,7 @@ def _is_default(name: str, dtype: torch.dtype, iterations: int) -> bool:
 # ---- solver error
 
 
-def contender_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, counts: list[int]) -> list[Row]:
+def candidate_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, counts: list[int]) -> list[Row]:
     """A compiled solver at several iteration counts, against the converged step."""
     state, exact = bench.hard_step(setting)
     solver, setup = bench.solver(name, setting)
@@ -74,15 +74,15 @@ def contender_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting
         )
         for count in counts
     ]  # fmt: skip
-    return _judged(rows)
+    return _with_status(rows)
 
 
-def _judged(rows: list[Row]) -> list[Row]:
+def _with_status(rows: list[Row]) -> list[Row]:
     """Rows of one method, ordered by iterations, with their status."""
     if not rows:
         return []
     energies = [row.error_energy for row in rows]
-    statuses = verdicts([row.error for row in rows], rows[0].uncertainty or 0.0, energies)
+    statuses = row_statuses([row.error for row in rows], rows[0].uncertainty or 0.0, energies)
     return [replace(row, status=status) for row, status in zip(rows, statuses, strict=True)]
 
 
@@ -108,12 +108,12 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
             traces, iterations, exact.errors_of(traces[0].displacements[iterations]),
             {**common, "setup_milliseconds": setup, "bytes": memory.peak_bytes, "bytes_by": "tracemalloc"},
         )
-        for iterations in _shown(traces[0], counts, every=method.few)
+        for iterations in _reported_iterations(traces[0], counts, every=method.few)
     ]  # fmt: skip
-    return _judged(rows)
+    return _with_status(rows)
 
 
-def _shown(trace: Trace, counts: list[int], *, every: bool) -> list[int]:
+def _reported_iterations(trace: Trace, counts: list[int], *, every: bool) -> list[int]:
     """Iterations that become rows: those of the other methods and the last; all of them if `every`."""
     wanted = set(trace.displacements) - {0} if every else {*counts, trace.last}
     return sorted(k for k in wanted if 0 < k <= trace.last)
@@ -162,12 +162,12 @@ def dense_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, co
                 bytes_by=how, **bench.time(play).columns(), **common,
             )
         )  # fmt: skip
-    return _judged(rows)
+    return _with_status(rows)
 
 
 def stiffness_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, counts: list[int]) -> list[Row]:
     """A compiled solver at one stiffness."""
-    rows = contender_rows(bench, name, dtype, setting, counts)
+    rows = candidate_rows(bench, name, dtype, setting, counts)
     return [Row(**{**vars(row), "axis": "stiffness"}) for row in rows]
 
 
@@ -198,7 +198,7 @@ def float_rows(bench: Bench, setting: Setting, counts: list[int]) -> list[Row]:
                 error_metres=float(np.linalg.norm(off, axis=1).max()), **timing.columns(),
             )
         )  # fmt: skip
-    return _judged(rows)
+    return _with_status(rows)
 
 
 # ---- time step and mesh: whole motions, solved so far that only one error remains

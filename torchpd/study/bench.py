@@ -33,18 +33,18 @@ __all__ = [
     "count_kernels",
     "measure_step",
     "precision_name",
+    "row_statuses",
     "solved_step",
     "time_calls",
-    "verdicts",
 ]
 
 # steps of which only one error is measured are solved by these, in turn
 SOLVED = 1e-9
 _SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 300), (Chebyshev(), 3000))
-_DOUBTFUL = 0.1  # limit of the uncertainty of the converged step, over the error measured against it
-_UNSEEN = 1e-8  # smaller errors appear in no figure or table
+_UNCERTAINTY_LIMIT = 0.1  # limit of the uncertainty of the converged step, over the error measured against it
+_SMALLEST_SHOWN = 1e-8  # smaller errors appear in no figure or table
 _SCATTER = 1.3  # 95th over 5th percentile of times on a machine that is busy with other work
-_LOWER = 1e-6  # energy below that of the converged step, over the first iterate's, that exceeds rounding
+_LOWER_ENERGY = 1e-6  # energy below that of the converged step, over the first iterate's, that exceeds rounding
 _DIVERGED = 2.0  # distance from the converged step, over that of the first iterate
 
 
@@ -108,7 +108,7 @@ class Bench:
             state = State(*(part.float().double() for part in state))
             exact = exact_steps(sim, state)[0]
             self._steps[setting] = (state, exact)
-            if exact.uncertainty > _DOUBTFUL * _UNSEEN:
+            if exact.uncertainty > _UNCERTAINTY_LIMIT * _SMALLEST_SHOWN:
                 warn_user(
                     f"study: the converged step at {setting.youngs:g} Pa has an uncertainty of "
                     f"{exact.uncertainty:.1e}: rows with errors up to ten times that are marked uncertain",
@@ -220,14 +220,14 @@ def precision_name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def verdicts(errors: Sequence[float], uncertainty: float = 0.0, energies: Sequence[float | None] = ()) -> list[str]:
+def row_statuses(errors: Sequence[float], uncertainty: float = 0.0, energies: Sequence[float | None] = ()) -> list[str]:
     """The status of each row of a method, ordered by iterations.
 
     "diverged": the error stays large to the end; early iterates of a method that descends in energy may be far off.
     "uncertain": the uncertainty of the converged step exceeds a tenth of the error, or could explain it. All rows are
     uncertain if an iterate has less energy than the converged step, which then is not the lowest minimum.
     """
-    if any(energy is not None and energy < -_LOWER for energy in energies):
+    if any(energy is not None and energy < -_LOWER_ENERGY for energy in energies):
         return ["uncertain" if math.isfinite(error) else "diverged" for error in errors]
     # the smallest error from here on
     best = [*accumulate(reversed([e if math.isfinite(e) else math.inf for e in errors]), min)][::-1]
@@ -235,7 +235,7 @@ def verdicts(errors: Sequence[float], uncertainty: float = 0.0, energies: Sequen
     for error, least in zip(errors, best, strict=True):
         if not math.isfinite(error):
             found.append("diverged")
-        elif uncertainty > _DOUBTFUL * max(error, _UNSEEN):
+        elif uncertainty > _UNCERTAINTY_LIMIT * max(error, _SMALLEST_SHOWN):
             found.append("uncertain")
         else:
             found.append("ok" if least <= _DIVERGED else "diverged")
@@ -285,7 +285,7 @@ def measure_step(
         precision=precision_name(sim.dtype),
         iterations=iterations,
         local_steps=iterations,
-        status=verdicts([errors.position], exact.uncertainty, [errors.energy])[0],
+        status=row_statuses([errors.position], exact.uncertainty, [errors.energy])[0],
         vertices=sim.vertices,
         tets=len(exact.problem.values.tets),
         time_step=sim.time_step,

@@ -24,7 +24,9 @@ __all__ = ["ConvergenceCurve", "SolvedAlreadyError", "compare_solvers", "measure
 _COLORS = ("#8a8d93", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
 
 
-_DOUBTFUL = 1e-6  # uncertainty of the converged step, in the unit of the errors, above which a warning is given
+_UNCERTAINTY_LIMIT = (
+    1e-6  # uncertainty of the converged step, in the unit of the errors, above which a warning is given
+)
 
 
 class SolvedAlreadyError(ValueError):
@@ -71,7 +73,7 @@ def measure_convergence(
         return after_step.positions
 
     exact = exact_steps(study, start)[0]
-    if exact.uncertainty > _DOUBTFUL:
+    if exact.uncertainty > _UNCERTAINTY_LIMIT:
         warn_user(
             f"measure_convergence: the converged step has an uncertainty of {exact.uncertainty:.1g} in the unit of the "
             "curves; ignore errors below it"

@@ -21,7 +21,7 @@ __all__ = [
     "curves_of",
     "draw_study",
     "float32_floor",
-    "in_words",
+    "method_label",
     "pareto_front",
 ]
 
@@ -72,7 +72,7 @@ def axis_label(name: str) -> str:
     }[name]
 
 
-def in_words(row: Row) -> str:
+def method_label(row: Row) -> str:
     """A published method with the language it runs in, unless its name says so."""
     return row.method if "NumPy" in row.method else f"{row.method} (float64: {row.parts or 'NumPy'})"
 
@@ -155,7 +155,7 @@ def _note_uncertain(figure: Any, rows: list[Row]) -> None:
 # ---- all solvers
 
 
-def _shown(rows: list[Row]) -> dict[str, list[Row]]:
+def _drawn_curves(rows: list[Row]) -> dict[str, list[Row]]:
     """Curves of the picture: this library in float32, published methods in float64."""
     chosen = [row for row in rows if row.method not in _REPEATED and (row.precision == "float32" or not row.compiled)]
     return dict(curves_of(chosen, lambda row: row.method))
@@ -167,14 +167,14 @@ def _draw_solvers(rows: list[Row], path: Path, scene_name: str) -> Path:
         2, f"{scene_name}: {max(row.tets for row in rows):,} tetrahedra, Young's modulus {_pascals(first.youngs)}, "
         f"time step {first.time_step:.3g} s. One step.", width=6.6,
     )  # fmt: skip
-    curves, refused = _shown(rows), dict[str, list[str]]()
+    curves, refused = _drawn_curves(rows), dict[str, list[str]]()
     for name, own in curves.items():
         color, width, dash = STYLES.get(name, _OTHER)
         timed = [row for row in own if row.milliseconds is not None]
         if own[0].refusal:
             refused.setdefault(own[0].refusal, []).append(name)
             continue
-        label = _LABELS.get(name, f"{name}, C++ float32" if own[0].compiled else in_words(own[0]))
+        label = _LABELS.get(name, f"{name}, C++ float32" if own[0].compiled else method_label(own[0]))
         for axis, xs in ((left, [row.iterations for row in timed]), (right, [row.milliseconds for row in timed])):
             axis.plot(
                 xs, _drawn(timed), color=color, linewidth=width, linestyle=dash, label=label if axis is left else ""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.checks import optional_module
-from .plots import SLOPES, STYLES, TOP, axis_label, curves_of, in_words, pareto_front
+from .plots import SLOPES, STYLES, TOP, axis_label, curves_of, method_label, pareto_front
 from .results_log import Row
 
 __all__ = ["write_report"]
@@ -89,7 +89,7 @@ def write_report(rows: list[Row], record: dict[str, Any], path: Path) -> Path:
     """
     plotly = optional_module("plotly.io", "plotly", "reports", "study")
     jinja = optional_module("jinja2", "jinja2", "reports", "study").Environment(autoescape=True)
-    jinja.filters["shown"] = _shown
+    jinja.filters["shown"] = _format_cell
     figures = [
         (title, words, plotly.to_html(
             figure, full_html=False, include_plotlyjs="inline" if number == 0 else False,
@@ -105,7 +105,7 @@ def write_report(rows: list[Row], record: dict[str, Any], path: Path) -> Path:
     return path
 
 
-def _shown(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     """Text of a cell: numbers to three digits, integers in full."""
     if isinstance(value, float):
         return f"{value:.3g}" if math.isfinite(value) else ""
@@ -176,12 +176,12 @@ def _trace(rows: list[Row], place: Callable[[Row], float | None], name: str, sty
             "size": [18 if row.default else 10 if row.status != "ok" else 5 for row in drawn],
             "symbol": ["star" if row.default else _SYMBOLS.get(row.status, "circle") for row in drawn],
         },
-        hovertext=[_words(row) for row in drawn],
+        hovertext=[_hover_text(row) for row in drawn],
         hoverinfo="text",
     )
 
 
-def _words(row: Row) -> str:
+def _hover_text(row: Row) -> str:
     """Hover text of a point."""
     number = ("error", "uncertainty", "error_energy", "error_metres", "residual", "milliseconds", "milliseconds_p5",
               "milliseconds_p95", "setup_milliseconds", "bytes", "kernels", "local_steps")  # fmt: skip
@@ -206,7 +206,7 @@ def _solver_figure(rows: list[Row], place: Callable[[Row], float | None], axis: 
         if compiled:
             width, name = (width, f"{name}, float32") if precision == "float32" else (1.0, f"{name}, float64")
         elif not own[0].refusal:
-            name = in_words(own[0])
+            name = method_label(own[0])
         if own[0].refusal:
             figure.add_scatter(x=[None], y=[None], mode="markers", marker={"symbol": "x", "color": color},
                                name=f"{name} (refused: {own[0].refusal})", legendrank=1001)  # fmt: skip

@@ -26,7 +26,7 @@ from ..common.provenance import describe_run
 from ..plan.placement import find_device
 from .axes import (
     baseline_rows,
-    contender_rows,
+    candidate_rows,
     dense_rows,
     float_rows,
     mesh_rows,
@@ -101,12 +101,12 @@ def _setting(studied: StudyScene, options: StudyOptions) -> Setting:
 
 def _solver_tasks(bench: Bench, setting: Setting, counts: list[int]) -> dict[str, Task]:
     tasks: dict[str, Task] = {}
-    for name, contender in CANDIDATES.items():
-        if bench.device.type not in contender.devices:
+    for name, candidate in CANDIDATES.items():
+        if bench.device.type not in candidate.devices:
             continue
         for dtype in (torch.float32, torch.float64):
             key = f"solver: {name}, {precision_name(dtype)}"
-            tasks[key] = partial(contender_rows, bench, name, dtype, setting, counts)
+            tasks[key] = partial(candidate_rows, bench, name, dtype, setting, counts)
     fewer = [count for count in counts if count <= _LITERATURE_MOST]
     if bench.device.type == "cuda":
         for name in DENSE:

@@ -177,7 +177,7 @@ class Studio:
         with _mitsuba() as mi:
             scene = mi.load_dict(self._scene(mi, positions, normals))
             radiance = np.array(mi.render(scene, spp=self.samples))
-        return _develop(_denoise(radiance))
+        return _to_srgb(_denoise(radiance))
 
     def _radius(self) -> float:
         return max(float(np.linalg.norm(self.high - self.low)) / 2.0, 1e-6)
@@ -299,7 +299,7 @@ def _denoise(radiance: Radiance) -> Radiance:
     return np.asarray(denoise(wide, hdr=True)[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN])
 
 
-def _develop(radiance: Radiance) -> Picture:
+def _to_srgb(radiance: Radiance) -> Picture:
     """Convert linear radiance to sRGB; values above 0.7 are compressed towards white instead of clipped."""
     linear = np.maximum(radiance, 0.0)
     linear = np.where(linear > 0.7, 1.0 - 0.3 * np.exp(-(linear - 0.7) / 0.3), linear)
