@@ -53,14 +53,14 @@ def test_estimate_leaves_the_simulator_alone(stiff_beam: tuple[pd.Simulator, pd.
         pd.estimate_rho(sim, state, method, iterations=20)  # type: ignore[arg-type]
     assert same_bits(sim(state), before)
     assert sim.solver == pd.Jacobi(diagonal="plain")
-    with pytest.raises(ValueError, match='method must be "two-stage", "power" or "bound", got \'exact\''):
+    with pytest.raises(ValueError, match=r"method .*got 'exact'"):
         pd.estimate_rho(sim, state, "exact")  # type: ignore[arg-type]
     for part, wrong in ((0, pd.State(state[0] * torch.nan, state[1])), (1, pd.State(state[0], state[1] / 0.0))):
         with pytest.raises(ValueError, match=f"estimate_rho: state.{state._fields[part]} must be finite"):
             pd.estimate_rho(sim, wrong)
-    with pytest.raises(ValueError, match=r"estimate_rho: state must hold at least one environment, got \[0, \d+, 3\]"):
+    with pytest.raises(ValueError, match=r"estimate_rho: state .*got \[0, \d+, 3\]"):
         pd.estimate_rho(sim, sim.rest_state(0))
-    with pytest.raises(TypeError, match=r"state must be a State, .* got NoneType"):
+    with pytest.raises(TypeError, match=r"state .*got NoneType"):
         pd.estimate_rho(sim, None, "power")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="iterations must be >= 20"):
+    with pytest.raises(ValueError, match=r"iterations .*got 1"):
         pd.estimate_rho(sim, state, iterations=1)

@@ -147,7 +147,7 @@ def test_material_of_environments(count: int) -> None:
     assert worst_error(sim, swinging(sim, 3)) <= result.error
     assert sim.tune(error=1e-2).batch == count
     if count == 3:
-        with pytest.raises(ValueError, match="state must have the 3 environments of the material, got 2"):
+        with pytest.raises(ValueError, match=r"state .*got 2"):
             sim.tune(swinging(sim, 2), error=1e-2)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 import warnings
 
 import pytest
@@ -18,33 +17,33 @@ def test_candidates_may_be_given() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert sim.tune(swinging(sim), error=0.3, candidates=[pd.Jacobi()]).solver == pd.Jacobi()
-    with pytest.raises(ValueError, match="candidates must hold at least one solver"):
+    with pytest.raises(ValueError, match=r"candidates .*got none"):
         sim.tune(error=0.1, candidates=[])
     with pytest.raises(TypeError, match=r"candidates must be solvers, .* got 'auto'"):
         sim.tune(error=0.1, candidates=["auto"])  # type: ignore[list-item]
-    with pytest.raises(ValueError, match=r"velocities must be \[2, 63, 3\] like positions \(m/s\), got \[3, 63, 3\]"):
+    with pytest.raises(ValueError, match=r"velocities .*got \[3, 63, 3\]"):
         sim.tune(pd.State(sim.rest_state(2).positions, sim.rest_state(3).velocities), error=0.1)
 
 
 @pytest.mark.parametrize(
     ("request_", "message"),
     [
-        ({}, "exactly one of error and milliseconds must be given, got error=None and milliseconds=None"),
+        ({}, "got error=None and milliseconds=None"),
         (
             {"error": 0.1, "milliseconds": 1.0},
-            "exactly one of error and milliseconds must be given, got error=0.1 and milliseconds=1.0",
+            r"got error=0\.1 and milliseconds=1\.0",
         ),
-        ({"error": 0.0}, "error must lie in (0, 1)"),
-        ({"error": 1.5}, "error must lie in (0, 1)"),
-        ({"milliseconds": -1.0}, "milliseconds must be positive and finite"),
-        ({"error": 0.1, "most": 0}, "most must be a whole number >= 1, got 0"),
-        ({"error": 0.1, "most": 1.5}, "most must be a whole number >= 1, got 1.5"),
-        ({"error": math.nan}, "error must be finite, got nan"),
-        ({"error": 0.1, "candidates": []}, "candidates must hold at least one solver"),
+        ({"error": 0.0}, r"error .*got 0\.0"),
+        ({"error": 1.5}, r"error .*got 1\.5"),
+        ({"milliseconds": -1.0}, r"milliseconds .*got -1\.0"),
+        ({"error": 0.1, "most": 0}, "most .*got 0"),
+        ({"error": 0.1, "most": 1.5}, r"most .*got 1\.5"),
+        ({"error": math.nan}, "error .*got nan"),
+        ({"error": 0.1, "candidates": []}, "candidates .*got none"),
     ],
 )
 def test_bad_requests_are_named(request_: dict[str, float], message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
+    with pytest.raises(ValueError, match=message):
         bar().tune(**request_)  # type: ignore[arg-type]
 
 
@@ -62,7 +61,7 @@ def test_states_that_are_not_finite_are_named() -> None:
     sim = bar()
     state = swinging(sim, batch=3)
     state.velocities[1, 4, 2] = math.nan
-    with pytest.raises(ValueError, match=r"state\.velocities must be finite, got NaN or infinity in environment 1"):
+    with pytest.raises(ValueError, match=r"state\.velocities .*got NaN or infinity in environment 1"):
         sim.tune(state, error=0.1)
 
 
@@ -82,7 +81,7 @@ def test_a_singular_system_is_named() -> None:
     sim = bar()
     with torch.no_grad():
         sim.masses[20] = 0.0
-    with pytest.raises(ValueError, match=r"the system is singular: vertex 20 has inertia 0 N/m"):
+    with pytest.raises(ValueError, match=r".*vertex 20 has inertia 0 N/m"):
         sim.tune(swinging(sim), error=0.1)
 
 

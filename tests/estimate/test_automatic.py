@@ -328,7 +328,7 @@ def test_print_says_why_and_any_other_solver_ends_it() -> None:
     assert isinstance(sim.solver, pd.Multilevel)
     with pytest.raises(TypeError, match=r"solver must be .*, got the class Multilevel: write Multilevel\(\)"):
         beam(1e5, solver=pd.Multilevel)
-    with pytest.raises(TypeError, match=r"solver must be .*'auto', .*, got 'fast'"):
+    with pytest.raises(TypeError, match=r"solver .*got 'fast'"):
         sim.solver = "fast"  # type: ignore[assignment]
     assert sim.choice is not None
 

@@ -129,7 +129,7 @@ def test_more_blocks_than_declared_are_refused_in_binary_gmsh_files(tmp_path: Pa
     tets_in(path)
     block = struct.pack("<3iQ5Q", 3, 2, 4, 1, 3, 1, 2, 3, 5)
     path.write_bytes(path.read_bytes().replace(b"\n$EndElements", block + b"\n$EndElements"))
-    with pytest.raises(ValueError, match=r"section \$Elements holds more than it declares"):
+    with pytest.raises(ValueError, match=r"section \$Elements .*declares"):
         TetMesh.from_file(path)
 
 

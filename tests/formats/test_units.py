@@ -42,7 +42,7 @@ def test_a_declared_unit_is_not_overruled(tmp_path: Path) -> None:
         assert np.ptp(pd.TriMesh.from_file(tmp_path / "bar.usda", unit="mm").bounds) == pytest.approx(0.04)
     UsdGeom.SetStageMetersPerUnit(stage, 0.01)
     stage.Save()
-    with pytest.raises(ValueError, match=r"unit must be None for bar\.usda, which declares its unit, got 'mm'"):
+    with pytest.raises(ValueError, match=r"unit must be None for bar\.usda, .*got 'mm'"):
         pd.TriMesh.from_file(tmp_path / "bar.usda", unit="mm")
 
 

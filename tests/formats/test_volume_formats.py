@@ -279,7 +279,7 @@ def test_counts_of_vtu_are_compared(tmp_path: Path) -> None:
         "offsets of Cells must rise": piece({**arrays, "offsets": arrays["offsets"].replace("4 8", "4 9")}),
         "name point 7": piece({**arrays, "connectivity": arrays["connectivity"].replace("1 2 3 4", "1 2 3 7")}),
         "no array 'types'": piece({**arrays, "types": ""}),
-        "must be numbers, got 'x'": piece({**arrays, "types": arrays["types"].replace("10 10", "10 x")}),
+        r"must .*got 'x'": piece({**arrays, "types": arrays["types"].replace("10 10", "10 x")}),
     }
     for words, text in cases.items():
         (tmp_path / "a.vtu").write_text(vtu(text))

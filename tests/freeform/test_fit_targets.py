@@ -105,27 +105,31 @@ def folded() -> pd.TriMesh:
     ("target", "options", "message"),
     [
         (inside_out(), {}, "counter-clockwise seen from outside, got a closed surface of volume -"),
-        (half_turned(), {}, "must be an oriented surface: .* must have the same orientation"),
+        (half_turned(), {}, r"target .*got edge \[2, 6\]"),
         (folded(), {"patches": 4}, r"must be a height over the base, .* it folds there; use more patches"),
         (np.zeros((100, 3)), {}, "a cloud must have at least 64 points"),
-        (np.zeros((100, 2)), {}, r"target must be \[n, 3\] \(a cloud of points \[m\]\), got \[100, 2\]"),
-        (np.full((100, 3), np.nan), {}, "target must be finite, got nan"),
-        (ball(3).vertices, {"normals": np.ones((3, 3))}, r"normals must be \[642, 3\]"),
-        (ball(3).vertices, {"normals": np.zeros((642, 3))}, "normals must have a length, got 0 at 0"),
+        (np.zeros((100, 2)), {}, r"target .*got \[100, 2\]"),
+        (np.full((100, 3), np.nan), {}, "target .*got nan"),
+        (ball(3).vertices, {"normals": np.ones((3, 3))}, r"normals .*got \[3, 3\]"),
+        (ball(3).vertices, {"normals": np.zeros((642, 3))}, "normals .*got 0 at 0"),
         (ball(3), {"normals": np.ones((642, 3))}, "normals belong to a cloud of points"),
         (ball(3), {"bounds": BOX}, "bounds belong to a function"),
         (lambda x: x.norm(dim=1) - 1.0, {}, "bounds must say where the surface of a function lies"),
-        (lambda x: x.norm(dim=1) - 1.0, {"bounds": BOX[::-1]}, "bounds must be a lower and an upper corner"),
+        (
+            lambda x: x.norm(dim=1) - 1.0,
+            {"bounds": BOX[::-1]},
+            r"bounds .*got \[\[1\.5, 1\.5, 1\.5\], \[-1\.5, -1\.5, -1\.5\]\]",
+        ),
         (lambda x: x.norm(dim=1) + 1.0, {"bounds": BOX}, "must enclose a body within its bounds, .* got no closed"),
         (lambda x: x, {"bounds": BOX}, r"must turn points \[N, 3\] into a tensor \[N\], got \[2, 3\] for N=2"),
         (lambda x: x.detach().norm(dim=1), {"bounds": BOX}, "must be differentiable by torch"),
         (lambda x: x.norm(dim=1) * np.nan, {"bounds": BOX}, "must have finite values and gradients, got"),
-        (ball(3), {"patches": 3}, "patches must be a whole number >= 4, got 3"),
-        (ball(3), {"quadrics": 0}, "quadrics must be a whole number >= 1, got 0"),
-        (ball(3), {"optimizer": "sgd"}, "optimizer must be lm or adam, got 'sgd'"),
-        (ball(3), {"iterations": 0}, "iterations must be a whole number >= 1, got 0"),
+        (ball(3), {"patches": 3}, "patches .*got 3"),
+        (ball(3), {"quadrics": 0}, "quadrics .*got 0"),
+        (ball(3), {"optimizer": "sgd"}, "optimizer .*got 'sgd'"),
+        (ball(3), {"iterations": 0}, "iterations .*got 0"),
         (ball(3), {"radius_cap": 0.01}, "radius_cap must be >= 0.1"),
-        (ball(3), {"base": "round"}, "base must be one of flat, phong, got 'round'"),
+        (ball(3), {"base": "round"}, "base .*got 'round'"),
     ],
 )
 def test_what_cannot_be_fitted(target: Any, options: dict[str, Any], message: str) -> None:
@@ -134,7 +138,7 @@ def test_what_cannot_be_fitted(target: Any, options: dict[str, Any], message: st
 
 
 def test_a_target_of_another_kind() -> None:
-    with pytest.raises(TypeError, match=r"target must be a TriMesh, .* got str"):
+    with pytest.raises(TypeError, match=r"target .*got str"):
         target_of("bunny.obj")
 
 

@@ -26,11 +26,11 @@ def made(vertices: Any, triangles: Any, *args: Any, **options: Any) -> pd.FreeFo
     [
         (CORNERS, [[0, 1, 2], [1, 0, 3], [0, 1, 4]], r"must belong to at most two triangles, got edge \[0, 1\] with 3"),
         (CORNERS[:4], [[0, 1, 2], [0, 1, 3]], r"must have the same orientation, got edge \[0, 1\] in the same"),
-        ([*CORNERS[:3], [0.5, 0.0, 0.0]], [[0, 1, 2], [1, 0, 3]], r"areas must not vanish, got \[1, 0, 3\] at 1"),
-        (CORNERS[:3], [[0, 1, 1]], r"corners must differ, got \[0, 1, 1\]"),
-        (CORNERS, [[0, 1, 2]], "every vertex must belong to an element, got 2 of 5 that do not"),
-        (CORNERS[:3], np.empty((0, 3), dtype=np.int64), "triangles must hold at least one element"),
-        ([[math.nan, 0, 0], *CORNERS[1:3]], [[0, 1, 2]], "vertices must be finite"),
+        ([*CORNERS[:3], [0.5, 0.0, 0.0]], [[0, 1, 2], [1, 0, 3]], r"areas .*got \[1, 0, 3\] at 1"),
+        (CORNERS[:3], [[0, 1, 1]], r"corners .*got \[0, 1, 1\]"),
+        (CORNERS, [[0, 1, 2]], r"every .*got 2 of 5 that do not"),
+        (CORNERS[:3], np.empty((0, 3), dtype=np.int64), "triangles .*got none"),
+        ([[math.nan, 0, 0], *CORNERS[1:3]], [[0, 1, 2]], "vertices .*got nan"),
     ],
 )  # fmt: skip
 def test_surfaces(vertices: Any, triangles: Any, message: str) -> None:
@@ -39,7 +39,7 @@ def test_surfaces(vertices: Any, triangles: Any, message: str) -> None:
 
 
 def test_vertex_numbers() -> None:
-    with pytest.raises(IndexError, match=r"triangles must lie in 0..2 .*, got \[0, 1, 3\] at 0"):
+    with pytest.raises(IndexError, match=r"triangles .*got \[0, 1, 3\] at 0"):
         made(CORNERS[:3], [[0, 1, 3]])
 
 
@@ -63,13 +63,13 @@ def test_normals_that_cancel() -> None:
 @pytest.mark.parametrize(
     ("options", "error", "message"),
     [
-        ({"base": "round"}, ValueError, "base must be one of flat, phong, got 'round'"),
-        ({"measured_at": "top"}, ValueError, "measured_at must be one of base, surface, got 'top'"),
-        ({"thickness": -1.0}, ValueError, "thickness must be >= 0, got -1"),
-        ({"directors": torch.zeros(3, 3, dtype=F64)}, ValueError, r"must be of unit length, got .* at 0 \(3 in all\)"),
-        ({"directors": torch.ones(2, 3, dtype=F64)}, ValueError, r"directors must be \[3, 3\]"),
-        ({"directors": torch.zeros(3, 3)}, ValueError, "directors must be torch.float64 on cpu like vertices"),
-        ({"quadrics": lump(dtype=torch.float32)}, ValueError, "quadrics must be torch.float64 on cpu like vertices"),
+        ({"base": "round"}, ValueError, "base .*got 'round'"),
+        ({"measured_at": "top"}, ValueError, "measured_at .*got 'top'"),
+        ({"thickness": -1.0}, ValueError, "thickness .*got -1"),
+        ({"directors": torch.zeros(3, 3, dtype=F64)}, ValueError, r"directors .*got .* at 0 \(3 in all\)"),
+        ({"directors": torch.ones(2, 3, dtype=F64)}, ValueError, r"directors .*got \[2, 3\]"),
+        ({"directors": torch.zeros(3, 3)}, ValueError, r"directors .*got torch\.float32"),
+        ({"quadrics": lump(dtype=torch.float32)}, ValueError, r"quadrics .*got torch\.float32"),
     ],
 )  # fmt: skip
 def test_options(options: Any, error: Any, message: str) -> None:
@@ -126,36 +126,36 @@ def test_bound_of_the_steepness_holds() -> None:
 def test_samples() -> None:
     patches = made(CORNERS[:3], [[0, 1, 2]])
     b = torch.tensor([[0.2, 0.3, 0.5]], dtype=F64)
-    with pytest.raises(IndexError, match=r"patch must lie in 0..0, got 1 to 1"):
+    with pytest.raises(IndexError, match=r"patch .*got 1 to 1"):
         patches.samples(torch.tensor([1]), b)
-    with pytest.raises(ValueError, match=r"patch must be integers \[1\] like barycentrics, got torch.int64 \[2\]"):
+    with pytest.raises(ValueError, match=r"patch .*got torch.int64 \[2\]"):
         patches.samples(torch.tensor([0, 0]), b)
-    with pytest.raises(ValueError, match=r"barycentrics must be \[n, 3\]"):
+    with pytest.raises(ValueError, match=r"barycentrics .*got \[1, 2\]"):
         patches.samples(torch.tensor([0]), b[:, :2])
-    with pytest.raises(ValueError, match="reading must be one of clip, literal, got 'both'"):
+    with pytest.raises(ValueError, match=r"reading .*got 'both'"):
         patches.field(b, torch.tensor([0]), reading="both")  # type: ignore[arg-type]
 
 
 def test_from_mesh_takes_meshes() -> None:
-    with pytest.raises(TypeError, match="mesh must be a TriMesh, got TetMesh"):
+    with pytest.raises(TypeError, match=r"mesh .*got TetMesh"):
         pd.FreeFormPatches.from_mesh(pd.shapes.single_tet())  # type: ignore[arg-type]
 
 
 def test_transport() -> None:
     patches = made(CORNERS[:3], [[0, 1, 2]])
     flat = torch.tensor([[0.3, 0.3, 1e-5]], dtype=F64)
-    with pytest.raises(ValueError, match=r"apexes must lie off the plane of their patch, .*, got 1e-05 m for patch 0"):
+    with pytest.raises(ValueError, match=r"apexes .*, got 1e-05 m for patch 0"):
         pd.PatchTransport(patches, flat)
     below = torch.tensor([[0.3, 0.3, -1.0]], dtype=F64)
-    with pytest.raises(ValueError, match=r"apex must lie in 0..0 \(there are 1 apexes\), got 1 to 1"):
+    with pytest.raises(ValueError, match=r"apex .*got 1 to 1"):
         pd.PatchTransport(patches, below, torch.tensor([1]))
-    with pytest.raises(ValueError, match=r"apex must be integers \[1\], one for each patch, got \[2\]"):
+    with pytest.raises(ValueError, match=r"apex .*got \[2\]"):
         pd.PatchTransport(patches, below, torch.tensor([0, 0]))
-    with pytest.raises(ValueError, match="mode must be transport or rotation, got 'none'"):
+    with pytest.raises(ValueError, match=r"mode .*got 'none'"):
         pd.PatchTransport(patches, below, mode="none")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="stretch must be"):
+    with pytest.raises(ValueError, match=r"stretch .*got \(0\.0, 2\.0\)"):
         pd.PatchTransport(patches, below, stretch=(0.0, 2.0))
-    with pytest.raises(ValueError, match=r"positions must be \[2, 4, 3\]"):
+    with pytest.raises(ValueError, match=r"positions .*got Double \[2, 5, 3\]"):
         pd.PatchTransport(patches, below)(torch.zeros(2, 5, 3, dtype=F64))
 
 
@@ -188,46 +188,46 @@ STATE = pd.State(*(torch.zeros(1, 13, 3, dtype=F64) for _ in range(2)))
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: made(CORNERS[:3], [[0, 1, 2]], 3), "quadrics must be Quadrics, got int"),
-        (lambda: SURFACE.with_quadrics(None), "quadrics must be Quadrics, got NoneType"),
+        (lambda: made(CORNERS[:3], [[0, 1, 2]], 3), "quadrics .*got int"),
+        (lambda: SURFACE.with_quadrics(None), "quadrics .*got NoneType"),
         (
             lambda: pd.Quadrics.from_radii(RAY[:, 0], RAY, 0.1),
-            "radii must be a float32 or .*, got float",
+            "radii .*got float",
         ),
         (lambda: lump().values([[0.0, 0.0, 0.0]]), r"points must be torch.float64 \[..., 3\] \(m\), got list"),
         (
             lambda: lump().values(RAY.float()),
-            r"must be torch.float64 \[..., 3\] \(m\), got torch.float32 \[1, 3\]",
+            r"points .*got torch.float32 \[1, 3\]",
         ),
-        (lambda: SURFACE.samples([0], RAY), "patch must be a tensor of integers, got list"),
-        (lambda: SURFACE.heights(RAY), "samples must be PatchSamples, got Tensor; FreeFormPatches.samples makes them"),
-        (lambda: SURFACE.surface(None), "samples must be PatchSamples, got NoneType"),
-        (lambda: SURFACE.surface(PLACE, STATE), "pose must be PatchPose, got State; PatchBody.pose makes one"),
+        (lambda: SURFACE.samples([0], RAY), "patch .*got list"),
+        (lambda: SURFACE.heights(RAY), "samples .*got Tensor.*FreeFormPatches.samples"),
+        (lambda: SURFACE.surface(None), "samples .*got NoneType"),
+        (lambda: SURFACE.surface(PLACE, STATE), "pose .*got State.*PatchBody.pose"),
         (
             lambda: SURFACE.field([[0.0, 0.0, 0.0]], torch.tensor([0])),
-            "points must be a float32 or .*, got list",
+            r"points .* float32 or .*, got list",
         ),
         (
             lambda: SURFACE.field(RAY, APEX[:1], matrices=[1.0]),
-            r"must be a tensor W \[Q, 4, 4\], .*, got list",
+            "matrices .*got list",
         ),
-        (lambda: RAYS.cast_field(RAY, RAY, far=1.0, matrices=RAY), r"matrices must be a tensor W .*, got \[1, 3\]"),
-        (lambda: RAYS.cast(RAY, RAY, STATE), "pose must be PatchPose, got State; PatchBody.pose makes one"),
-        (lambda: RAYS.cast(RAY, RAY, STATE.positions), "pose must be PatchPose, got Tensor"),
+        (lambda: RAYS.cast_field(RAY, RAY, far=1.0, matrices=RAY), r"matrices .*got \[1, 3\]"),
+        (lambda: RAYS.cast(RAY, RAY, STATE), "pose .*got State.*PatchBody.pose"),
+        (lambda: RAYS.cast(RAY, RAY, STATE.positions), "pose .*got Tensor"),
         (
             lambda: RAYS.cast(RAY.tolist(), RAY),
-            r"origins must be a tensor \[R, 3\], or \[B, R, 3\] .*, got list",
+            "origins .*got list",
         ),
-        (lambda: RAYS.cast(RAY, RAY, patches=3), "patches must be FreeFormPatches, got int"),
-        (lambda: RAYS.render(None, (8, 6)), "camera must be a torchpd.viewing.render.Camera, got NoneType"),
-        (lambda: RAYS.render(CAMERA, (8, 6.5)), r"size must be two whole numbers, .* got \(8, 6.5\)"),
-        (lambda: RAYS.render(CAMERA, 8), "size must be two whole numbers, width and height in pixels, got 8"),
-        (lambda: BODY.pose(STATE), r"positions must be a tensor \[B, 13, 3\], got State; take state.positions"),
-        (lambda: pd.PatchLoss(ball(0), ball(2)), "patches must be FreeFormPatches, got TriMesh"),
-        (lambda: pd.PatchLoss(SURFACE, ball(2))(SURFACE.to(dtype=torch.float32)), "must be torch.float64 on cpu like"),
-        (lambda: pd.PatchTransport(None, RAY), "PatchTransport: patches must be FreeFormPatches, got NoneType"),
-        (lambda: pd.PatchTransport(SURFACE, RAY, APEX, stretch="ab"), "stretch must hold real numbers, got <U2"),
-        (lambda: pd.PatchLoss(SURFACE, ball(2))(ball(0)), "patches must be FreeFormPatches, got TriMesh"),
+        (lambda: RAYS.cast(RAY, RAY, patches=3), "patches .*got int"),
+        (lambda: RAYS.render(None, (8, 6)), "camera .*got NoneType"),
+        (lambda: RAYS.render(CAMERA, (8, 6.5)), r"size .*got \(8, 6.5\)"),
+        (lambda: RAYS.render(CAMERA, 8), "size .*got 8"),
+        (lambda: BODY.pose(STATE), "positions .*got State; take state.positions"),
+        (lambda: pd.PatchLoss(ball(0), ball(2)), "patches .*got TriMesh"),
+        (lambda: pd.PatchLoss(SURFACE, ball(2))(SURFACE.to(dtype=torch.float32)), r"patches .*got torch\.float32"),
+        (lambda: pd.PatchTransport(None, RAY), "PatchTransport: patches .*got NoneType"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX, stretch="ab"), "stretch .*got <U2"),
+        (lambda: pd.PatchLoss(SURFACE, ball(2))(ball(0)), "patches .*got TriMesh"),
     ],
 )
 def test_other_kinds_of_things(call: Any, message: str) -> None:
@@ -238,26 +238,26 @@ def test_other_kinds_of_things(call: Any, message: str) -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: SURFACE.samples(torch.tensor([2**40]), RAY), "patch must lie in 0..19, got 1099511627776 to"),
-        (lambda: SURFACE.samples(torch.tensor([True]), RAY), r"patch must be integers \[1\] .*, got torch.bool"),
-        (lambda: SURFACE.field(RAY[0], torch.tensor([0])), r"field: points must be \[n, 3\]"),
-        (lambda: pd.PatchTransport(SURFACE, RAY, APEX, stretch=3), "stretch must be .*, got 3"),
-        (lambda: pd.PatchTransport(SURFACE, RAY, APEX + 0.5), r"apex must be integers \[20\]"),
-        (lambda: RAYS.cast(RAY[0], RAY), r"origins must be a tensor \[R, 3\], or \[B, R, 3\] in B poses, got \[3\]"),
-        (lambda: pd.PatchBody(SURFACE, stiffness=1e4, apex=RAY.numpy()), "apex must be skeleton or prism, got array"),
-        (lambda: pd.fit_patches(ball(1), 1.5), "quadrics must be a whole number >= 1, got 1.5"),
-        (lambda: pd.fit_patches(ball(1), 2, patches=20.5), "patches must be a whole number >= 4, got 20.5"),
+        (lambda: SURFACE.samples(torch.tensor([2**40]), RAY), "patch .*got 1099511627776 to"),
+        (lambda: SURFACE.samples(torch.tensor([True]), RAY), "patch .*got torch.bool"),
+        (lambda: SURFACE.field(RAY[0], torch.tensor([0])), r"field: points .*got \[3\]"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX, stretch=3), "stretch .*got 3"),
+        (lambda: pd.PatchTransport(SURFACE, RAY, APEX + 0.5), r"apex .*got \[20\]"),
+        (lambda: RAYS.cast(RAY[0], RAY), r"origins .*got \[3\]"),
+        (lambda: pd.PatchBody(SURFACE, stiffness=1e4, apex=RAY.numpy()), "apex .*got array"),
+        (lambda: pd.fit_patches(ball(1), 1.5), "quadrics .*got 1.5"),
+        (lambda: pd.fit_patches(ball(1), 2, patches=20.5), "patches .*got 20.5"),
         (
             lambda: pd.fit_patches(ball(1), 2, patches="x"),
-            "patches must be a whole number >= 4, got 'x'",
+            "patches .*got 'x'",
         ),
-        (lambda: pd.PatchLoss(SURFACE, ball(2), level=2.5), "level must be a whole number >= 2, got 2.5"),
+        (lambda: pd.PatchLoss(SURFACE, ball(2), level=2.5), "level .*got 2.5"),
         (lambda: pd.PatchLoss(SURFACE, ball(2))(patches_on(ball(1))), "must have the 20 triangles that the loss was"),
         (lambda: Camera((0.0, 0.0, 1.0), (0.0, 0.0, 1.0), 40.0), "origin and target must differ horizontally"),
         (lambda: Camera((0.0, 3.0, 1.0), (0.0, 0.0, 1.0), 40.0), "origin and target must differ horizontally"),
-        (lambda: Camera((math.nan, 3.0, 1.0), (0.0, 0.0, 1.0), 40.0), "Camera.origin must be finite, got nan"),
-        (lambda: Camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 180.0), "fov must lie between 0 and 180 degrees, got 180"),
-        (lambda: Camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 0.0), "fov must lie between 0 and 180 degrees, got 0"),
+        (lambda: Camera((math.nan, 3.0, 1.0), (0.0, 0.0, 1.0), 40.0), "Camera.origin .*got nan"),
+        (lambda: Camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 180.0), "fov .*got 180"),
+        (lambda: Camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), 0.0), "fov .*got 0"),
     ],
 )
 def test_values_out_of_range(call: Any, message: str) -> None:

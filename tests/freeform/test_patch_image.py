@@ -104,7 +104,7 @@ def test_descent_finds_the_height_of_a_bump(device: torch.device) -> None:
 
 def test_refusals() -> None:
     rays = pd.PatchRays(patches_on())
-    with pytest.raises(ValueError, match="size must be at least 1 x 1 pixel"):
+    with pytest.raises(ValueError, match=r"size .*got 0 x 4"):
         rays.render(CAMERA, (0, 4))
-    with pytest.raises(ValueError, match="ambient must lie in"):
+    with pytest.raises(ValueError, match=r"ambient .*got 1\.5"):
         rays.render(CAMERA, (4, 4), ambient=1.5)

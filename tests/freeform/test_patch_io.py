@@ -64,8 +64,8 @@ def test_errors(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"format 2, written by torchpd 9; .* install a newer torchpd"):
         pd.FreeFormPatches.load(file)
     write({}, "quadrics.factors")
-    with pytest.raises(ValueError, match=r"is damaged or of another version: 'quadrics.factors'"):
+    with pytest.raises(ValueError, match=r".*version: 'quadrics.factors'"):
         pd.FreeFormPatches.load(file)
     write({"base": "round"})
-    with pytest.raises(ValueError, match="base must be one of flat, phong, got 'round'"):
+    with pytest.raises(ValueError, match=r"base .*got 'round'"):
         pd.FreeFormPatches.load(file)

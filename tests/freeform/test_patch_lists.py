@@ -132,5 +132,5 @@ def test_new_quadrics_have_new_lists() -> None:
     assert listed(patches.with_quadrics(other)) != listed(patches)
     assert listed(patches.with_quadrics(other, keep_lists=True)) == listed(patches)
     assert patches.with_quadrics(other, keep_lists=True).quadrics is other
-    with pytest.raises(ValueError, match="keep_lists needs 12 quadrics as before, got 3"):
+    with pytest.raises(ValueError, match=r"keep_lists .*got 3"):
         patches.with_quadrics(quadrics_on(ball(), 3), keep_lists=True)

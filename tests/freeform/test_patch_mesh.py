@@ -115,8 +115,8 @@ def test_one_patch() -> None:
 def test_refusals() -> None:
     patches = patches_on()
     for level in (0, -1, 2.0, True, "3"):
-        with pytest.raises(ValueError, match="level must be a whole number of segments >= 1"):
+        with pytest.raises(ValueError, match=r"level .*segments >= 1"):
             patches.mesh(level)  # type: ignore[arg-type]
     transport = central(patches)
-    with pytest.raises(ValueError, match="pose must be of one environment, got 3"):
+    with pytest.raises(ValueError, match=r"pose .*got 3"):
         patches.mesh(2, transport(tumbled(transport)))

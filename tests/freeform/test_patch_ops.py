@@ -256,22 +256,22 @@ def test_second_derivatives_are_refused() -> None:
 @pytest.mark.parametrize(
     ("name", "number", "change", "error", "message"),
     [
-        ("height", 2, lambda t: t.float(), TypeError, "amplitudes must be Double like the other arguments"),
-        ("height", 3, lambda t: t[:, :2], ValueError, r"centres must be \[5, 3\] \(m\), got Double \[5, 2\]"),
-        ("height", 5, lambda t: t[:4], ValueError, r"barycentrics must be \[9, 3\]"),
-        ("height", 6, lambda t: t[:4], ValueError, "lists must be 11 arrays, got 4"),
-        ("height", 6, lambda t: [t[0].long(), *t[1:]], TypeError, "lists.triangles must be Int"),
-        ("height", 6, lambda t: [t[0][:3], *t[1:]], ValueError, r"lists.triangles must be \[20, 3\] .*FreeFormPatches"),
-        ("surface", 0, lambda t: t[0], ValueError, r"positions must be \[batch, vertices, 3\] \(m\)"),
-        ("surface", 1, lambda t: t[:1], ValueError, r"frames must be \[2, 12, 3, 3\]"),
-        ("field", 3, lambda t: torch.cat([t, t]), ValueError, "matrices must be one set or one for each of 2 poses"),
-        ("deformation", 2, lambda t: t[:, :2], ValueError, r"fallback must be \[2, 20, 3, 3\]"),
+        ("height", 2, lambda t: t.float(), TypeError, r"amplitudes .*got Float \[5\]"),
+        ("height", 3, lambda t: t[:, :2], ValueError, r"centres .*got Double \[5, 2\]"),
+        ("height", 5, lambda t: t[:4], ValueError, r"barycentrics .*got Double \[4, 3\]"),
+        ("height", 6, lambda t: t[:4], ValueError, "lists .*got 4"),
+        ("height", 6, lambda t: [t[0].long(), *t[1:]], TypeError, r"lists.triangles .*got Long \[20, 3\]"),
+        ("height", 6, lambda t: [t[0][:3], *t[1:]], ValueError, r"lists.triangles .*got Int \[3, 3\]"),
+        ("surface", 0, lambda t: t[0], ValueError, r"positions .*got Double \[12, 3\]"),
+        ("surface", 1, lambda t: t[:1], ValueError, r"frames .*got Double \[1, 12, 3, 3\]"),
+        ("field", 3, lambda t: torch.cat([t, t]), ValueError, r"matrices .*got Double \[4, 5, 4, 4\]"),
+        ("deformation", 2, lambda t: t[:, :2], ValueError, r"fallback .*got Double \[2, 2, 3, 3\]"),
         (
             "deformation",
             3,
             lambda t: t[:2],
             ValueError,
-            "constraints must be 3 arrays, got 2; .*PatchTransport.constraints",
+            "constraints .*got 2; .*PatchTransport.constraints",
         ),
         (
             "deformation",
@@ -280,7 +280,7 @@ def test_second_derivatives_are_refused() -> None:
             ValueError,
             r"point_tet must be .* PatchTransport.constraints",
         ),
-        ("frames", 1, lambda t: t[:2], ValueError, r"weights must be \[20\] \(area of each patch at rest, m\^2\)"),
+        ("frames", 1, lambda t: t[:2], ValueError, r"weights .*got Double \[2\]"),
     ],
 )
 def test_refusals(name: str, number: int, change: Any, error: Any, message: str) -> None:
@@ -292,10 +292,10 @@ def test_refusals(name: str, number: int, change: Any, error: Any, message: str)
 
 def test_other_refusals() -> None:
     args, options = arguments("field", ("flat", "base"), F64, torch.device("cpu"))
-    with pytest.raises(ValueError, match=r"thickness must be finite and >= 0 \[m\], got -1"):
+    with pytest.raises(ValueError, match=r"thickness .*got -1"):
         ops.patch_field(*args, **{**options, "thickness": -1.0})
     args, options = arguments("deformation", ("flat", "base"), F64, torch.device("cpu"))
-    with pytest.raises(ValueError, match=r"lower must lie in \(0, 1\]"):
+    with pytest.raises(ValueError, match=r"lower .*got 0"):
         ops.patch_deformation(*args, **{**options, "lower": 0.0})
     gradients, areas, lists = arguments("frames", ("flat", "base"), F64, torch.device("cpu"))[0]
     mapped = [torch.stack([t, t]) for t in lists]

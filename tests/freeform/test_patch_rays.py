@@ -281,12 +281,12 @@ def test_refusals() -> None:
     patches = patches_on()
     rays = pd.PatchRays(patches)
     o, d = towards_ball(4)
-    with pytest.raises(TypeError, match="patches must be FreeFormPatches"):
+    with pytest.raises(TypeError, match=r"patches .*got TriMesh"):
         pd.PatchRays(ball())  # type: ignore[arg-type]
     for level in (0, 33, 2.0, True):
         with pytest.raises(ValueError, match=r"level must be a whole number in 1\.\.32"):
             pd.PatchRays(patches, level)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"origins must be torch\.float64"):
+    with pytest.raises(ValueError, match=r"origins .*got torch\.float32"):
         rays.cast(o.float(), d)
     with pytest.raises(ValueError, match="near and far"):
         rays.cast(o, d, near=2.0, far=1.0)
@@ -294,19 +294,19 @@ def test_refusals() -> None:
         rays.cast(o, d, patches=patches_on(ball(0)))
     with pytest.raises(ValueError, match="of 1 or of all 1 poses"):
         rays.cast(o.expand(2, -1, -1), d)
-    with pytest.raises(ValueError, match="far must be finite"):
+    with pytest.raises(ValueError, match=r"far .*got inf"):
         rays.cast_field(o, d, far=math.inf)
-    with pytest.raises(ValueError, match="reading must be one of"):
+    with pytest.raises(ValueError, match=r"reading .*got 'other'"):
         rays.cast_field(o, d, far=1.0, reading="other")  # type: ignore[arg-type]
 
 
 # of patch_surface_rays and patch_field_rays: an argument, a place in it, how many there are, the words
 OUTSIDE = {
-    "corner": ("surface", 3, (4, 1), 7842, r"cells must hold corners and checks in 0\.\.7841, .*got \[.*\] at 4"),
-    "check": ("surface", 3, (4, 14), 7842, r"cells must hold corners and checks in 0\.\.7841, .*got \[.*\] at 4"),
+    "corner": ("surface", 3, (4, 1), 7842, r"cells .* 0\.\.7841, .*got \[.*\] at 4"),
+    "check": ("surface", 3, (4, 14), 7842, r"cells .* 0\.\.7841, .*got \[.*\] at 4"),
     "patch": ("surface", 3, (4, 15), 20, r"patches in 0\.\.19 .*got \[.*\] at 4; PatchRays makes it"),
     "place": ("surface", 3, (4, 16), 49, r"places in 0\.\.48, got \[.*\] at 4; PatchRays makes it"),
-    "order": ("field", 5, (4,), 20, r"order must hold each patch in 0\.\.19 once, got -?\d+ at 4; PatchRays makes it"),
+    "order": ("field", 5, (4,), 20, r"order .* 0\.\.19 once, got -?\d+ at 4; PatchRays makes it"),
 }
 
 
@@ -339,15 +339,15 @@ def test_every_patch_has_a_place_in_the_order() -> None:
     args, options = op_arguments("field", F64, torch.device("cpu"))
     args[5] = args[5].clone()
     args[5][7] = args[5][3]
-    with pytest.raises(IndexError, match=r"order must hold each patch in 0\.\.19 once, got \d+ at 7"):
+    with pytest.raises(IndexError, match=r"order .*got \d+ at 7"):
         torch.ops.torchpd.patch_field_rays(*args, **options)
 
 
 @pytest.mark.parametrize(
     ("name", "number", "message"),
     [
-        ("surface", 3, r"cells must be \[\d+, 17\] .*; PatchRays makes it$"),
-        ("field", 5, r"order must be \[20\] .*; PatchRays makes it$"),
+        ("surface", 3, r"cells .*got Int \[980, 5\]"),
+        ("field", 5, r"order .*got Int \[5\]"),
     ],
 )
 def test_the_way_out_is_not_that_of_a_plan(name: str, number: int, message: str) -> None:

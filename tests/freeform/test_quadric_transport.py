@@ -185,9 +185,9 @@ def test_patches_of_another_kind_are_refused() -> None:
         pd.QuadricTransport(transport, patches_on(ball(2)))
     with pytest.raises(ValueError, match=want):
         pd.QuadricTransport(transport, patches.with_shape(2 * patches.vertices, patches.directors))
-    with pytest.raises(TypeError, match=r"patches are torch\.float32 on cpu and the transport torch\.float64"):
+    with pytest.raises(TypeError, match=r"patches are torch\.float32 .*transport torch\.float64"):
         pd.QuadricTransport(transport, patches.to(dtype=torch.float32))
-    with pytest.raises(TypeError, match="transport must be a PatchTransport, got FreeFormPatches"):
+    with pytest.raises(TypeError, match=r"transport .*got FreeFormPatches"):
         pd.QuadricTransport(patches, transport)  # type: ignore[arg-type]
     rule = pd.QuadricTransport(transport, patches)
     transport.float()

@@ -94,15 +94,15 @@ def test_other_refusals() -> None:
     one = quadrics_on(ball(), 3)
     with pytest.raises(ValueError, match=r"signs must be \+1 or -1, got otherwise at 2"):
         pd.Quadrics.from_matrices(one.matrices()[0], torch.tensor([1.0, -1.0, 0.5]))
-    with pytest.raises(ValueError, match=r"Quadrics.factors must be \[3, 6\] .*, got \[3, 5\]"):
+    with pytest.raises(ValueError, match=r"Quadrics.factors .*got \[3, 5\]"):
         pd.Quadrics(one.amplitudes, one.centres, one.factors[:, :5])
-    with pytest.raises(TypeError, match=r"Quadrics.amplitudes must be a float32 or float64 tensor .*, got torch.int64"):
+    with pytest.raises(TypeError, match=r"Quadrics.amplitudes .*got torch.int64"):
         pd.Quadrics(torch.ones(3, dtype=torch.int64), one.centres, one.factors)
-    with pytest.raises(ValueError, match=r"Quadrics.centres must be torch.float64 on cpu like amplitudes"):
+    with pytest.raises(ValueError, match=r"Quadrics.centres .*got torch\.float32"):
         pd.Quadrics(one.amplitudes, one.centres.float(), one.factors)
-    with pytest.raises(ValueError, match="radii must be positive"):
+    with pytest.raises(ValueError, match=r"radii .*got 0\.0"):
         pd.Quadrics.from_radii(one.amplitudes, one.centres, torch.zeros(3, dtype=F64))
-    with pytest.raises(ValueError, match=r"radii must be \[3, 3\] .*, got \[3, 2\]"):
+    with pytest.raises(ValueError, match=r"radii .*got \[3, 2\]"):
         pd.Quadrics.from_radii(one.amplitudes, one.centres, torch.ones(3, 2, dtype=F64))
 
 

@@ -305,8 +305,8 @@ def test_a_solid_weighs_and_resists_by_the_share_and_meshes_without_one_keep_the
 @pytest.mark.parametrize(
     ("fill", "message"),
     [
-        ([0.5, 0.5], r"TetMesh\.fill must be \[1\] .*got \[2\]"),
-        ([0.0], r"TetMesh\.fill must lie in \(0, 1\], got 0\.0 at 0 \(1 in all\)"),
+        ([0.5, 0.5], r"TetMesh\.fill .*got \[2\]"),
+        ([0.0], r"TetMesh\.fill .*got 0\.0 at 0 \(1 in all\)"),
         ([1.5], r"got 1\.5 at 0"),
         ([float("nan")], "got nan at 0"),
     ],

@@ -63,21 +63,21 @@ FLAT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
 
 BAD_TETS = [
     (NAN, TET, ValueError, r"TetMesh\.vertices must be finite, got nan at \[2, 1\] \(1 in all\)"),
-    (CORNERS[:, :2], TET, ValueError, r"TetMesh\.vertices must be \[n, 3\].*got \[4, 2\]"),
-    (CORNERS > 0, TET, TypeError, r"TetMesh\.vertices must hold real numbers, got bool"),
-    (CORNERS + 1j, TET, TypeError, r"TetMesh\.vertices must hold real numbers, got complex128"),
+    (CORNERS[:, :2], TET, ValueError, r"TetMesh\.vertices .*got \[4, 2\]"),
+    (CORNERS > 0, TET, TypeError, r"TetMesh\.vertices .*got bool"),
+    (CORNERS + 1j, TET, TypeError, r"TetMesh\.vertices .*got complex128"),
     ([[0.0, 0, 0], [1]], TET, ValueError, r"TetMesh\.vertices must be numbers in a regular array"),
-    (np.empty((0, 3)), TET, ValueError, r"TetMesh\.vertices must hold at least one vertex"),
-    (CORNERS, np.empty((0, 4), dtype=int), ValueError, r"TetMesh\.tets must hold at least one element"),
-    (CORNERS, [], ValueError, r"TetMesh\.tets must hold at least one element"),
-    (CORNERS, TET[:, :3], ValueError, r"TetMesh\.tets must be \[n, 4\].*got \[1, 3\]"),
-    (CORNERS, TET.astype(float), TypeError, r"TetMesh\.tets must hold integers .*got float64"),
-    (CORNERS, TET > 0, TypeError, r"TetMesh\.tets must hold integers .*got bool"),
-    (CORNERS, [[0, 1, 2, 4]], IndexError, r"TetMesh\.tets must lie in 0\.\.3 .*got \[0, 1, 2, 4\] at 0"),
-    (CORNERS, [[0, 1, 2, 3], [0, 1, -1, 3]], IndexError, r"must lie in 0\.\.3 .*got \[0, 1, -1, 3\] at 1"),
+    (np.empty((0, 3)), TET, ValueError, r"TetMesh\.vertices .*got none"),
+    (CORNERS, np.empty((0, 4), dtype=int), ValueError, r"TetMesh\.tets .*got none"),
+    (CORNERS, [], ValueError, r"TetMesh\.tets .*got none"),
+    (CORNERS, TET[:, :3], ValueError, r"TetMesh\.tets .*got \[1, 3\]"),
+    (CORNERS, TET.astype(float), TypeError, r"TetMesh\.tets .*got float64"),
+    (CORNERS, TET > 0, TypeError, r"TetMesh\.tets .*got bool"),
+    (CORNERS, [[0, 1, 2, 4]], IndexError, r"TetMesh\.tets .*got \[0, 1, 2, 4\] at 0"),
+    (CORNERS, [[0, 1, 2, 3], [0, 1, -1, 3]], IndexError, r"TetMesh\.tets .*got \[0, 1, -1, 3\] at 1"),
     (CORNERS, np.array([[0, 1, 2, 2**63]], dtype=np.uint64), IndexError, r"must lie in 0\.\.3"),
-    (CORNERS, [[0, 1, 2, 2]], ValueError, r"corners must differ, got \[0, 1, 2, 2\] at 0 .*drop_degenerate=True"),
-    (FLAT, TET, ValueError, r"volumes must exceed the rounding.*got \[0, 1, 2, 3\] at 0 .*drop_degenerate=True"),
+    (CORNERS, [[0, 1, 2, 2]], ValueError, r"corners .*got \[0, 1, 2, 2\] at 0 .*drop_degenerate=True"),
+    (FLAT, TET, ValueError, r"volumes .*got \[0, 1, 2, 3\] at 0 .*drop_degenerate=True"),
     (np.vstack([CORNERS, CORNERS[:1]]), TET, ValueError, r"got 1 of 5 .*the first is 4.*drop_unreferenced=True"),
 ]
 
@@ -89,11 +89,11 @@ def test_bad_tets_are_refused_by_name(vertices, tets, error, message) -> None:
 
 
 BAD_TRIANGLES = [
-    (NAN, [[0, 1, 2]], ValueError, r"TriMesh\.vertices must be finite"),
-    (CORNERS, [[0, 1, 9]], IndexError, r"TriMesh\.triangles must lie in 0\.\.3"),
-    (CORNERS, [[0, 1, 1]], ValueError, r"TriMesh\.triangles: corners must differ.*drop_degenerate=True"),
+    (NAN, [[0, 1, 2]], ValueError, r"TriMesh\.vertices .*got nan"),
+    (CORNERS, [[0, 1, 9]], IndexError, r"TriMesh\.triangles .*got \[0, 1, 9\]"),
+    (CORNERS, [[0, 1, 1]], ValueError, r"TriMesh\.triangles: corners .*got \[0, 1, 1\].*drop_degenerate=True"),
     (CORNERS, [[0, 1, 2]], ValueError, r"TriMesh\.vertices: every vertex must belong.*drop_unreferenced=True"),
-    (CORNERS, TET, ValueError, r"TriMesh\.triangles must be \[n, 3\].*got \[1, 4\]"),
+    (CORNERS, TET, ValueError, r"TriMesh\.triangles .*got \[1, 4\]"),
 ]
 
 
@@ -104,7 +104,7 @@ def test_bad_triangles_are_refused_by_name(vertices, triangles, error, message) 
 
 
 def test_texture_coordinates_belong_to_vertices() -> None:
-    with pytest.raises(ValueError, match=r"TriMesh\.uvs must be \[3, 2\]"):
+    with pytest.raises(ValueError, match=r"TriMesh\.uvs .*got \[4, 2\]"):
         TriMesh(CORNERS[:3], [[0, 1, 2]], uvs=np.zeros((4, 2)))
 
 
@@ -142,7 +142,7 @@ def test_zero_volume_is_what_rounding_can_make(scale: float, offset: float) -> N
     for _ in range(50):
         turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         vertices = scale * (FLAT @ turn.T + offset)
-        with pytest.raises(ValueError, match="volumes must exceed the rounding"):
+        with pytest.raises(ValueError, match=r"volumes .*got \[0, 1, 2, 3\]"):
             TetMesh(vertices, TET)
     # A height of 1e4 times the bound, per unit of base, is far outside of it, and accepted.
     reach, longest = scale * (offset + 2.0), scale * np.sqrt(2.0)
@@ -310,13 +310,13 @@ def test_translated_and_scaled() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda m: m.transformed(np.eye(2)), r"matrix must be \[3, 3\] or \[4, 4\].*got \[2, 2\]"),
-        (lambda m: m.transformed(np.ones((4, 4))), r"last row must be \[0, 0, 0, 1\], got \[1\.0"),
-        (lambda m: m.transformed(np.diag([1.0, np.nan, 1.0])), "matrix must be finite"),
-        (lambda m: m.transformed(np.diag([1.0, 0.0, 1.0])), "volumes must exceed the rounding"),
-        (lambda m: m.translated((1.0, 2.0)), r"offset must be \[3\]"),
-        (lambda m: m.translated((0.0, 1e300, 0.0)), "volumes must exceed the rounding"),
-        (lambda m: m.scaled(-1.0), "factor must be one positive number or three"),
+        (lambda m: m.transformed(np.eye(2)), r"matrix .*got \[2, 2\]"),
+        (lambda m: m.transformed(np.ones((4, 4))), r"matrix .*got \[1\.0"),
+        (lambda m: m.transformed(np.diag([1.0, np.nan, 1.0])), "matrix .*got nan"),
+        (lambda m: m.transformed(np.diag([1.0, 0.0, 1.0])), r"volumes .*got \[0, 1, 2, 3\]"),
+        (lambda m: m.translated((1.0, 2.0)), r"offset .*got \[2\]"),
+        (lambda m: m.translated((0.0, 1e300, 0.0)), r"volumes .*got \[0, 1, 2, 3\]"),
+        (lambda m: m.scaled(-1.0), r"factor .*got -1\.0"),
     ],
 )
 def test_bad_motions_are_refused(call, message: str) -> None:
@@ -328,7 +328,7 @@ def test_a_tet_that_comes_twice_is_refused_or_left_out() -> None:
     mesh = shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
     turned = mesh.tets[[7, 5, 7]][:, [1, 2, 0, 3]]  # an even permutation: as good a tet
     tets = np.concatenate([mesh.tets, turned])
-    with pytest.raises(ValueError, match=r"tets must be distinct \(that at 7 comes again.* at 48 \(3 in all\)"):
+    with pytest.raises(ValueError, match=r"tets .*got \[10, 14, 1, 11\] at 48 \(3 in all\)"):
         TetMesh(mesh.vertices, tets)
     with pytest.warns(MeshWarning, match="3 of 51 tets come twice and were left out"):
         once = TetMesh(mesh.vertices, tets, drop_degenerate=True)

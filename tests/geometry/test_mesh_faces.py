@@ -214,9 +214,9 @@ def test_the_tolerance_of_merging() -> None:
     assert len(mesh.merged(0.99e-3).vertices) == 16
     joined = mesh.merged(1.01e-3)
     assert (len(joined.vertices), joined.quality().pieces) == (12, 1)
-    with pytest.raises(ValueError, match=r"TetMesh\.tets: corners must differ"):
+    with pytest.raises(ValueError, match=r"TetMesh\.tets: corners .*got \[0, 0, 0, 0\]"):
         mesh.merged(1.2)
-    with pytest.raises(ValueError, match=r"TetMesh\.merged: tolerance must be >= 0.* got -1"):
+    with pytest.raises(ValueError, match=r"TetMesh\.merged: tolerance .*got -1"):
         mesh.merged(-1.0)
 
 
@@ -229,7 +229,7 @@ def test_a_mesh_that_is_there_twice() -> None:
         twice = TetMesh(*beside(BOX, BOX))
     twice = twice.with_embedding(embed_triangles(twice.vertices, twice.tets, twice.boundary()[:48]))
     with pytest.raises(
-        ValueError, match=r"TetMesh.tets: tets must be distinct.* \(48 in all\); pass drop_degenerate=True"
+        ValueError, match=r"TetMesh.tets: tets .*got \[0, 9, 12, 13\] .*\(48 in all\).*drop_degenerate=True"
     ):
         twice.merged()
     with pytest.warns(MeshWarning, match="48 of 96 tets come twice"):

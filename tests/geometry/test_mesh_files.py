@@ -79,7 +79,7 @@ def test_scenes_are_joined_with_their_places() -> None:
     scene.add_geometry(trimesh.PointCloud(np.zeros((1, 3))))
     with pytest.warns(MeshWarning, match="without triangles left out: PointCloud"):
         assert len(TriMesh.from_trimesh(scene).triangles) == 24
-    with pytest.raises(TypeError, match="must be a Trimesh or a Scene, got int"):
+    with pytest.raises(TypeError, match=r"surface .*got int"):
         TriMesh.from_trimesh(3)
 
 
@@ -134,7 +134,7 @@ def test_files_that_cannot_hold_tets_are_refused(tmp_path: Path, name: str) -> N
 
 
 def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"TetMesh\.to_file: there is no folder .*nowhere for tets\.vtu"):
+    with pytest.raises(FileNotFoundError, match=r"TetMesh\.to_file: there .*folder .*nowhere for tets\.vtu"):
         shapes.single_tet().to_file(tmp_path / "nowhere" / "tets.vtu")
 
 
@@ -143,9 +143,7 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path: Path, capfd: pytest.Capture
     with pytest.raises(ValueError, match=r"cannot read broken\.mesh \(Medit\): Vertices should be 8 numbers"):
         TetMesh.from_file(tmp_path / "broken.mesh")
     (tmp_path / "hello.mesh").write_text("hello\n")
-    with pytest.raises(
-        ValueError, match=r"cannot read hello\.mesh \(Medit\): it must begin with MeshVersionFormatted, got 'hello'"
-    ):
+    with pytest.raises(ValueError, match=r"cannot read hello\.mesh \(Medit\): .* MeshVersionFormatted, got 'hello'"):
         TetMesh.from_file(tmp_path / "hello.mesh")
     assert capfd.readouterr() == ("", "")
     (tmp_path / "what.xyz").write_text("0 0 0")
@@ -239,9 +237,9 @@ def test_physical_groups_of_the_newer_format_become_regions(tmp_path: Path) -> N
 
 
 def test_bad_regions_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"TetMesh\.regions must be \[1\]"):
+    with pytest.raises(ValueError, match=r"TetMesh\.regions .*got \[2\]"):
         TetMesh(CORNERS, TET, regions=[1, 2])
-    with pytest.raises(TypeError, match=r"TetMesh\.regions must hold integers, got float64"):
+    with pytest.raises(TypeError, match=r"TetMesh\.regions .*got float64"):
         TetMesh(CORNERS, TET, regions=[1.5])
 
 

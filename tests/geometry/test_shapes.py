@@ -50,14 +50,14 @@ def test_single_tet_is_regular_and_centred() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: shapes.box((1, 1, 0)), r"box\.size must be positive \[m\]"),
-        (lambda: shapes.box((1, 1)), r"box\.size must be \[3\]"),
-        (lambda: shapes.box(cells=(1, 2)), r"box\.cells must be three whole numbers"),
-        (lambda: shapes.box(cells=(1, 2, 0)), r"box\.cells must be three whole numbers"),
-        (lambda: shapes.box(cells=(1, 2, 2.5)), r"box\.cells must be three whole numbers"),
-        (lambda: shapes.single_tet(0.0), r"single_tet\.edge must be positive"),
-        (lambda: shapes.octopus(arms=2), r"octopus\.arms must be a whole number from 3 to 8, got 2"),
-        (lambda: shapes.octopus(cells=20.5), r"octopus\.cells must be a whole number from 16 to 200"),
+        (lambda: shapes.box((1, 1, 0)), r"box\.size .*got \[1\.0, 1\.0, 0\.0\]"),
+        (lambda: shapes.box((1, 1)), r"box\.size .*got \[2\]"),
+        (lambda: shapes.box(cells=(1, 2)), r"box\.cells .*numbers"),
+        (lambda: shapes.box(cells=(1, 2, 0)), r"box\.cells .*numbers"),
+        (lambda: shapes.box(cells=(1, 2, 2.5)), r"box\.cells .*numbers"),
+        (lambda: shapes.single_tet(0.0), r"single_tet\.edge .*got 0\.0"),
+        (lambda: shapes.octopus(arms=2), r"octopus\.arms .*got 2"),
+        (lambda: shapes.octopus(cells=20.5), r"octopus\.cells .*got 20\.5"),
     ],
 )
 def test_bad_shapes_are_refused(call, message: str) -> None:

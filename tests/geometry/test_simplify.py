@@ -32,7 +32,7 @@ def test_a_torus_keeps_its_hole_and_its_volume() -> None:
     assert euler(coarse) == 0
     # a polygon of n corners has 1 - (2 pi / n)^2 / 6 of the area of its circle; about 150 vertices, 9 of them around
     assert coarse.volume() == pytest.approx(fine.volume(), rel=0.1)
-    with pytest.raises(ValueError, match=r"simplify: 4 triangles must be enough for the topology .* reached \d+"):
+    with pytest.raises(ValueError, match=r"simplify: 4 triangles .*topology .* reached \d+"):
         simplify(torus(), 4)
 
 
@@ -68,5 +68,5 @@ def test_what_is_coarse_enough_stays() -> None:
 
 
 def test_the_number_of_triangles() -> None:
-    with pytest.raises(ValueError, match="simplify: triangles must be >= 4, got 3"):
+    with pytest.raises(ValueError, match=r"simplify: triangles .*got 3"):
         simplify(ball(), 3)

@@ -284,9 +284,9 @@ def test_bad_positions_are_refused() -> None:
     count = embedding.vertex_count
     with pytest.raises(ValueError, match=rf"positions must be \[\.\.\., {count}, 3\].*got \[{count + 1}, 3\]"):
         embedding.apply(np.zeros((count + 1, 3)))
-    with pytest.raises(ValueError, match="positions must be"):
+    with pytest.raises(ValueError, match=r"positions .*got \[113\]"):
         embedding.apply(torch.zeros(count))
-    with pytest.raises(TypeError, match=r"must be floating point, got torch\.int64"):
+    with pytest.raises(TypeError, match=r"positions .*got torch\.int64"):
         embedding.apply(torch.zeros(count, 3, dtype=torch.int64))
 
 
@@ -341,7 +341,7 @@ def test_points_outside_go_to_the_nearest_tet() -> None:
 
 def test_an_embedding_of_the_wrong_size_is_refused() -> None:
     one = carried(tetrahedralize(ball(1), cells=2))
-    with pytest.raises(ValueError, match=r"Embedding\.weights must be \[\d+, 4\]"):
+    with pytest.raises(ValueError, match=r"Embedding\.weights .*got \[41, 4\]"):
         Embedding(one.surface, one.tets, one.weights[1:], one.corners, one.vertex_count)
     mine = one.weights.copy()
     kept = Embedding(one.surface, one.tets, mine, one.corners, one.vertex_count)
@@ -370,12 +370,12 @@ def test_progress_is_shown_on_demand(capfd: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"cells": 0}, ValueError, "cells must be >= 1, got 0"),
-        ({"cells": 2.5}, ValueError, "cells must be a whole number, got 2.5"),
+        ({"cells": 0}, ValueError, "cells .*got 0"),
+        ({"cells": 2.5}, ValueError, "cells .*got 2.5"),
         ({"cells": 5000}, ValueError, "cells=5000 asks for a lattice of .* use fewer cells"),
-        ({"method": "delaunay"}, ValueError, 'method must be "lattice" or "tetwild", got \'delaunay\''),
-        ({"surface": 3}, TypeError, "surface must be a TriMesh, .* got int"),
-        ({"surface": shapes.single_tet()}, TypeError, "surface must be a surface, got a TetMesh"),
+        ({"method": "delaunay"}, ValueError, "method .*got 'delaunay'"),
+        ({"surface": 3}, TypeError, "surface .*got int"),
+        ({"surface": shapes.single_tet()}, TypeError, "surface .*got a TetMesh"),
         ({"surface": "nothing.obj"}, FileNotFoundError, "no such mesh file"),
         ({"surface": TriMesh(np.ones((3, 3)), [[0, 1, 2]])}, ValueError, "must have an extent"),
     ],
@@ -387,7 +387,7 @@ def test_bad_arguments_are_refused(arguments, error, message: str) -> None:
 
 def test_tetwild_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pytetwild", None)
-    with pytest.raises(ImportError, match=r'needs the optional package pytetwild: pip install "pytetwild\[all\]"'):
+    with pytest.raises(ImportError, match=r'needs .*install "pytetwild\[all\]"'):
         tetrahedralize(ball(1), cells=4, method="tetwild")
 
 
@@ -414,9 +414,9 @@ def test_tetwild_meshes_are_checked_and_carry_the_surface(monkeypatch: pytest.Mo
 def test_embedding_takes_a_surface_and_a_mesh() -> None:
     box = shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
     surface = TriMesh(box.vertices[:3], [[0, 1, 2]])
-    with pytest.raises(TypeError, match="embed: surface must be a TriMesh, got TetMesh"):
+    with pytest.raises(TypeError, match=r"embed: surface .*got TetMesh"):
         embed(box, surface)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="embed: mesh must be a TetMesh, got ndarray"):
+    with pytest.raises(TypeError, match=r"embed: mesh .*got ndarray"):
         embed(surface, box.vertices)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="apply: positions must be a tensor or an array, got NoneType"):
+    with pytest.raises(TypeError, match=r"apply: positions .*got NoneType"):
         embed(surface, box).apply(None)  # type: ignore[call-overload]

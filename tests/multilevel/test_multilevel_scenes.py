@@ -354,7 +354,7 @@ def test_what_it_was_made_of_goes_along() -> None:
 
 def test_meta_is_refused() -> None:
     there = simulate(torch.float32).to("meta")
-    with pytest.raises(RuntimeError, match="device must be the CPU or a GPU for Multilevel, got meta"):
+    with pytest.raises(RuntimeError, match=r"device .*got meta"):
         there.solver = pd.Multilevel()
     assert there.solver == pd.Chebyshev()
 
@@ -372,7 +372,7 @@ def test_print_says_what_it_prepared() -> None:
 
 def test_settings_are_checked() -> None:
     for keywords, message in (
-        ({"outer": "newton"}, r"Multilevel\.outer must be one of 'corotated', 'lbfgs', 'momentum', got 'newton'"),
+        ({"outer": "newton"}, r"Multilevel\.outer .*got 'newton'"),
         ({"relaxation": 2.0}, r"Multilevel\.relaxation must lie in \(0, 2\)"),
         ({"relaxation": 0.0}, r"Multilevel\.relaxation must lie in \(0, 2\)"),
     ):
@@ -391,13 +391,13 @@ def test_ops_want_the_arrays_of_the_preconditioner() -> None:
         ops.precondition(state.positions, plan)
     sim.solver = pd.Multilevel()
     plan = list(sim.plan.arrays)
-    with pytest.raises(ValueError, match=r"field must have the 45 vertices of the plan, got Float \[1, 3, 3\]"):
+    with pytest.raises(ValueError, match=r"field .*got Float \[1, 3, 3\]"):
         ops.precondition(torch.zeros(1, 3, 3), plan)
-    with pytest.raises(TypeError, match=r"field must be float32 or float64"):
+    with pytest.raises(TypeError, match=r"field .*got Long \[1, 45, 3\]"):
         ops.precondition(state.positions.long(), plan)
-    with pytest.raises(ValueError, match=r"plan must be the 16 arrays of Plan\.arrays, or 44 with those of"):
+    with pytest.raises(ValueError, match=r"plan .*got 43"):
         ops.precondition(state.positions, plan[:-1])
-    with pytest.raises(ValueError, match=r"plan\.reference_stiffness must be \[\d+\] .*compile the scene again"):
+    with pytest.raises(ValueError, match=r"plan\.reference_stiffness .*got Float \[95\]"):
         ops.precondition(state.positions, [*plan[:17], plan[17][:-1].contiguous(), *plan[18:]])
 
 

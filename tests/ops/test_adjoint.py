@@ -232,9 +232,9 @@ def test_the_adjoint_of_a_rollout_checks_what_it_gets() -> None:
     ):
         with pytest.raises(ValueError, match=f"^{name} must be"):
             torch.ops.torchpd.rollout_vjp(none, none, none, none, first, speed, forces, arrays, plan, time_step=h)
-    with pytest.raises(ValueError, match="rollout_vjp: wanted must say of each of the"):
+    with pytest.raises(ValueError, match=r"rollout_vjp: wanted .*got 1 numbers"):
         torch.ops.torchpd.rollout_vjp(x, v, x, v, *state, None, arrays, plan, time_step=sim.time_step, wanted=[True])
-    with pytest.raises(ValueError, match="rollout_vjp: material must have"):
+    with pytest.raises(ValueError, match=r"rollout_vjp: material .*got 2"):
         torch.ops.torchpd.rollout_vjp(x, v, x, v, *state, None, arrays[:2], plan, time_step=sim.time_step)
 
 

@@ -168,6 +168,6 @@ def test_other_values_are_refused_and_change_nothing() -> None:
     for value in ("diagonal", None, True):
         with pytest.raises(ValueError, match=f'adjoint must be "solver" or "multilevel", got {value!r}'):
             sim.adjoint = value
-    with pytest.raises(ValueError, match="adjoint must be"):
+    with pytest.raises(ValueError, match=r"adjoint .*got 'cholesky'"):
         simulator("cholesky")
     assert (sim.adjoint, sim.plan) == ("multilevel", made)

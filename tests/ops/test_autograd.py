@@ -40,7 +40,7 @@ def test_functional_gradients_are_refused(steps: int) -> None:
         return (sim.rollout(start, steps) if steps else sim(start)).positions.sum()
 
     for function in (torch.func.grad(loss), torch.func.jacrev(loss)):
-        with pytest.raises(RuntimeError, match=r"within torch.func.grad, vjp or jacrev; use torch.autograd.grad"):
+        with pytest.raises(RuntimeError, match=r"within torch.func.grad, .*use torch.autograd.grad"):
             function(state.positions)
 
 

@@ -41,12 +41,12 @@ STATES: dict[str, tuple[Callable[[Tensor], dict[str, Tensor]], type[Exception], 
     "positions of integers": (
         lambda x: {"positions": x.long()},
         TypeError,
-        r"positions must be float32 or float64 .* got Long",
+        "positions .*got Long",
     ),
     "positions of halves": (
         lambda x: {"positions": x.half()},
         TypeError,
-        r"positions must be float32 or float64 .* got Half",
+        "positions .*got Half",
     ),
     "positions without batch": (
         lambda x: {"positions": x[0]},
@@ -56,37 +56,37 @@ STATES: dict[str, tuple[Callable[[Tensor], dict[str, Tensor]], type[Exception], 
     "positions in the plane": (
         lambda x: {"positions": x[..., :2]},
         ValueError,
-        r"positions must be \[batch, vertices, 3\]",
+        r"positions .*got Float \[2, 27, 2\]",
     ),
     "too many vertices": (
         lambda x: {"positions": twice(x), "velocities": twice(x)},
         ValueError,
-        r"positions must have the 27 vertices of the plan, got Float \[2, 54, 3\]",
+        r"positions .*got Float \[2, 54, 3\]",
     ),
     "other velocities": (
         lambda x: {"velocities": x[:1]},
         ValueError,
-        r"velocities must be \[2, 27, 3\] like positions \(m/s\), got Float \[1, 27, 3\]",
+        r"velocities .*got Float \[1, 27, 3\]",
     ),
     "precise velocities": (
         lambda x: {"velocities": x.double()},
         TypeError,
-        r"velocities must be Float like positions \(m/s\), got Double",
+        "velocities .*got Double",
     ),
     "other forces": (
         lambda x: {"forces": x[0]},
         ValueError,
-        r"forces must be \[2, 27, 3\] like positions \(N\)",
+        r"forces .*got Float \[27, 3\]",
     ),
     "precise forces": (
         lambda x: {"forces": x.double()},
         TypeError,
-        r"forces must be Float like positions",
+        r"forces .*got Double \[2, 27, 3\]",
     ),
     "other start": (
         lambda x: {"start": x[:, :5]},
         ValueError,
-        r"start must be \[2, 27, 3\] like positions \(first iterate, m\)",
+        r"start .*got Float \[2, 5, 3\]",
     ),
     "precise state": (
         lambda x: {"positions": x.double(), "velocities": x.double()},
@@ -106,10 +106,10 @@ def test_states_are_checked(name: str, sim: pd.Simulator) -> None:
 NUMBERS = {
     "schedule": ((-1, 6), r"schedule must be 0 \(jacobi\), .* 4 \(momentum\) or 5 \(corotated\), got"),
     "iterations": ((-1, 10**10), r"iterations must be 0\.\.1e9, got"),
-    "time_step": ((0.0, -1.0, math.nan, math.inf), r"time_step must be positive and finite \[s\], got"),
+    "time_step": ((0.0, -1.0, math.nan, math.inf), r"time_step .*finite \[s\], got"),
     "relaxation": ((0.0, 2.0, -0.1, math.nan), r"relaxation must lie in \(0, 2\), got"),
     "rho": ((-0.1, 1.0, math.nan), r"rho must lie in \[0, 1\), got"),
-    "delay": ((-1,), r"delay must be >= 0, got"),
+    "delay": ((-1,), "delay .*got -1"),
     "tolerance": ((-1e-3, math.nan), r"tolerance must be >= 0, got"),
 }
 
@@ -143,23 +143,23 @@ def test_steps_of_a_rollout_are_checked(steps: int, every: int, sim: pd.Simulato
 
 def test_material_is_checked(sim: pd.Simulator) -> None:
     wrong: list[tuple[str, Tensor, str]] = [
-        ("masses", sim.masses[:-1], r"material\.masses must be \[27\] or the same after a batch of 2, as many"),
-        ("masses", sim.masses.repeat(3, 1), r"material\.masses must be \[27\] or the same after a batch of 2"),
+        ("masses", sim.masses[:-1], r"material\.masses .*got Float \[26\]"),
+        ("masses", sim.masses.repeat(3, 1), r"material\.masses .*got Float \[3, 27\]"),
         (
             "masses",
             sim.masses.double(),
-            r"material\.masses must be Float \(lumped mass .* \[kg\]\), got Double",
+            r"material\.masses .*got Double",
         ),
-        ("gravity", sim.gravity[:2], r"material\.gravity must be \[3\]"),
-        ("damping", sim.damping[None, None], r"material\.damping must be \[\]"),
+        ("gravity", sim.gravity[:2], r"material\.gravity .*got Float \[2\]"),
+        ("damping", sim.damping[None, None], r"material\.damping .*got Float \[1, 1\]"),
         ("pin_stiffness", sim.pin_stiffness[:1], r"material\.pin_stiffness must be \[3\]"),
         ("pin_targets", sim.pin_targets.T, r"material\.pin_targets must be (contiguous|\[3, 3\])"),
-        ("planes", sim.planes[:, :4].contiguous(), r"material\.planes must be \[1, 5\]"),
-        ("spheres", sim.spheres[0], r"material\.spheres must have 2 dimensions, or 3 with a batch"),
+        ("planes", sim.planes[:, :4].contiguous(), r"material\.planes .*got Float \[1, 4\]"),
+        ("spheres", sim.spheres[0], r"material\.spheres .*got Float \[8\]"),
         (
             "stiffness",
             sim.stiffness[: len(sim.stiffness) // 2],
-            r"stiffness must be \[48\] or \[batch, 48\], one value per tetrahedron",
+            r"stiffness .*got Float \[24\]",
         ),
     ]
     for name, value, message in wrong:
@@ -171,7 +171,7 @@ def test_material_is_checked(sim: pd.Simulator) -> None:
         lambda: ops.gradient(x, few, plan),
         lambda: ops.elastic_diagonal(few, plan, weighted=True),
     ):
-        with pytest.raises(ValueError, match=r"material must be 8 arrays, got 7"):
+        with pytest.raises(ValueError, match=r"material .*got 7"):
             call()
 
 
@@ -180,24 +180,24 @@ def test_plans_are_checked(sim: pd.Simulator) -> None:
     none, many = plan.sizes.clone(), plan.sizes.clone()
     none[PATCHES], many[MOST_SLOTS] = 0, 1000
     wrong: list[tuple[str, Tensor, str]] = [
-        ("sizes", plan.sizes.long(), r"plan\.sizes must be Int \(counts\), got Long"),
-        ("sizes", plan.sizes[:-1], r"plan\.sizes must be \[9\] \(counts\), got Int \[8\]"),
-        ("sizes", none, r"plan\.sizes must count at least one patch"),
-        ("sizes", many, r"no more slots in one than in all, got 1 patches with up to 1000 of 27 slots"),
-        ("sizes", plan.sizes + 1, r"plan\.[a-z_]+ must be \[\d+\] .*; compile the scene again"),
-        ("tet_rest", plan.tet_rest.double(), r"plan\.tet_rest must be Float \(p, q, r, s, t and h of the inverse"),
-        ("tet_rest", plan.tet_rest[:, :9].contiguous(), r"plan\.tet_rest must be \[3, 96\] \(p, q, r"),
-        ("tet_rest", plan.tet_rest[:-1], r"plan\.tet_rest must be \[3, 96\] .* got Float \[2, 96\] on cpu; compile"),
+        ("sizes", plan.sizes.long(), r"plan\.sizes .*got Long"),
+        ("sizes", plan.sizes[:-1], r"plan\.sizes .*got Int \[8\]"),
+        ("sizes", none, r"plan\.sizes .*got 0 patches"),
+        ("sizes", many, r".*got 1 patches with up to 1000 of 27 slots"),
+        ("sizes", plan.sizes + 1, r"plan\.vertex_order .*got Int \[27\]"),
+        ("tet_rest", plan.tet_rest.double(), r"plan\.tet_rest .*got Double \[3, 96\]"),
+        ("tet_rest", plan.tet_rest[:, :9].contiguous(), r"plan\.tet_rest .*got Float \[3, 9\]"),
+        ("tet_rest", plan.tet_rest[:-1], r"plan\.tet_rest .*got Float \[2, 96\] on cpu"),
         ("tet_corner", plan.tet_corner.int(), r"plan\.tet_corner must be Short"),
         ("slot_vertex", plan.slot_vertex[:-1], r"plan\.slot_vertex must be \[27\] \(internal vertex"),
         ("vertex_group", plan.vertex_group[:-1], r"plan\.vertex_group must be \[27\]"),
         ("shared_slot", torch.zeros(1, dtype=torch.int32), r"plan\.shared_slot must be \[0\]"),
-        ("vertex_order", plan.vertex_order.flip(0)[::2], r"plan\.vertex_order must be contiguous"),
+        ("vertex_order", plan.vertex_order.flip(0)[::2], r"plan\.vertex_order .*got strides \[2\]"),
     ]
     for name, value, message in wrong:
         with pytest.raises((TypeError, ValueError), match=message):
             call_step(sim, plan=replaced(arrays, name, value, sim))
-    with pytest.raises(ValueError, match=r"plan must be the \d+ arrays of Plan\.arrays, .*got 1"):
+    with pytest.raises(ValueError, match=r"plan .*got 1"):
         call_step(sim, plan=arrays[:1])
 
 
@@ -226,9 +226,7 @@ def test_stiffness_of_a_diagonal_is_checked(sim: pd.Simulator) -> None:
         found: Tensor = ops.elastic_diagonal(replaced(sim.material(), "stiffness", stiffness, sim), plan, weighted=True)
         return found
 
-    with pytest.raises(
-        TypeError, match=r"stiffness must be float32 or float64 \[tets\] or \[batch, tets\] \(Pa\), got Long"
-    ):
+    with pytest.raises(TypeError, match=r"stiffness .*got Long"):
         diagonal(sim.stiffness.long())
     with pytest.raises(TypeError, match=r"plan\.[a-z_]+ must be Double \(.*\), got Float"):
         diagonal(sim.stiffness.double())
@@ -239,22 +237,22 @@ def test_step_in_place_checks_what_it_writes(sim: pd.Simulator) -> None:
     rest = (None, None, sim.material(), list(sim.plan.arrays))
     info = torch.empty(2, 7, dtype=torch.float64)
     for bad in (info[:1], info.float(), info[:, :5], info.T.contiguous().T):
-        with pytest.raises(ValueError, match=r"info must be a contiguous float64 \[2, 7\], got"):
+        with pytest.raises(ValueError, match=r"info .*contiguous float64 \[2, 7\], got"):
             ops.step_(x, v, bad, *rest, **settings(sim))
     for state in ((x.mT.contiguous().mT, v), (x, v.mT.contiguous().mT)):
-        with pytest.raises(ValueError, match="step_: positions and velocities must be contiguous"):
+        with pytest.raises(ValueError, match=r"step_: positions .*contiguous"):
             ops.step_(*state, info, *rest, **settings(sim))
 
 
 def test_rotations_are_checked() -> None:
     for bad, kind, message in (
-        (torch.eye(3).long(), TypeError, r"matrices must be float32 or float64 \[\.\.\., 3, 3\], got Long"),
-        (torch.zeros(3), ValueError, r"matrices must be \[\.\.\., 3, 3\], got Float \[3\]"),
-        (torch.zeros(5, 3, 2), ValueError, r"matrices must be \[\.\.\., 3, 3\]"),
+        (torch.eye(3).long(), TypeError, "matrices .*got Long"),
+        (torch.zeros(3), ValueError, r"matrices .*got Float \[3\]"),
+        (torch.zeros(5, 3, 2), ValueError, r"matrices .*got Float \[5, 3, 2\]"),
     ):
         with pytest.raises(kind, match=message):
             pd.nearest_rotation(bad)
-    with pytest.raises(TypeError, match=r"nearest_rotation: F must be a tensor \[\.\.\., 3, 3\], got ndarray"):
+    with pytest.raises(TypeError, match=r"nearest_rotation: F .*got ndarray"):
         pd.nearest_rotation(np.eye(3))  # type: ignore[arg-type]
     for other in (torch.zeros(1, 3, 3), torch.zeros(2, 3, 3, dtype=torch.float64)):
         with pytest.raises(ValueError, match=r"direction must be .* like matrices, got"):

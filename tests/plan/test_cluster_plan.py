@@ -198,5 +198,5 @@ def test_pins_know_their_vertices(plan: Arrays, values: SceneValues) -> None:
 
 def test_more_patches_than_a_cluster_has_are_refused() -> None:
     values = values_of("held box")
-    with pytest.raises(ValueError, match=r"patches of kernel 1, a cluster, must lie in 1\.\.16, got 17"):
+    with pytest.raises(ValueError, match=r"patches of kernel 1, .* 1\.\.16, got 17"):
         compile_device_plan(values, 17, CLUSTER, torch.float32)

@@ -345,12 +345,12 @@ def test_bad_arguments_are_refused() -> None:
             compile_device_plan(values, 1, kernel, torch.float32)
         with pytest.raises(ValueError, match=refusal):
             _C.build_device_plan(x, tets, 1, kernel, False, piece, lambda done: None)
-    with pytest.raises(ValueError, match=r"dtype must be torch\.float32 or torch\.float64, got torch\.float16"):
+    with pytest.raises(ValueError, match=r"dtype .*got torch\.float16"):
         compile_device_plan(values, 1, 0, torch.float16)
     for bad in (4, -1, 2**40):
         with pytest.raises(IndexError, match="tets refer to vertices that positions does not have"):
             _C.build_device_plan(x, np.array([[0, 1, 2, bad]]), 1, BLOCK, False, piece, lambda done: None)
-    with pytest.raises(ValueError, match=r"piece must be int32 \[vertices\], a number for each row of positions"):
+    with pytest.raises(ValueError, match=r"piece must be int32 \[vertices\], .*positions"):
         _C.build_device_plan(x, tets, 1, BLOCK, False, piece[:3], lambda done: None)
     for number in (-2, 4):
         with pytest.raises(ValueError, match="piece must hold numbers of pieces, counted from 0, or -1"):

@@ -38,7 +38,7 @@ def test_another_kernel_makes_the_plan_anew(monkeypatch: pytest.MonkeyPatch) -> 
     sim.kernel = "block"
     assert (sim.kernel, sim.plan.kernel) == ("block", "block")
     plan = sim.plan
-    for wrong, error in (("cluster", "does not fit"), ("warp", "kernel must be")):
+    for wrong, error in (("cluster", "does not fit"), ("warp", "kernel .*got 'warp'")):
         with pytest.raises(ValueError, match=error):
             sim.kernel = wrong
         assert (sim.kernel, sim.plan) == ("block", plan)
@@ -133,7 +133,7 @@ def test_a_simulator_passes_its_batch_on(monkeypatch: pytest.MonkeyPatch) -> Non
     sim.batch = 5
     assert asked == [3, 5]
     for wrong in (0, "x"):
-        with pytest.raises(ValueError, match="batch must be a whole number >= 1"):
+        with pytest.raises(ValueError, match=r"batch .*number >= 1"):
             sim.batch = wrong  # type: ignore[assignment]
     assert sim.batch == 5
     sim.batch = None

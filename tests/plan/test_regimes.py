@@ -87,7 +87,7 @@ def test_a_mesh_that_no_cluster_could_have_is_not_cut(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(regimes, "compile_device_plan", fail)
     for dtype in REAL:
-        with pytest.raises(ValueError, match=r"cluster needs patches smaller than 324 pairs .* and 138 vertices"):
+        with pytest.raises(ValueError, match=r"cluster .*than 324 pairs .* and 138 vertices"):
             choose_plan(values, dtype, H100, "cluster")
 
 
@@ -193,7 +193,7 @@ def test_a_kernel_that_does_not_fit_is_refused_with_numbers() -> None:
         match=r"'grid' does not fit this GPU: .*grid needs (at least )?[\d,]+ B, 5,000 B are available; .*stream",
     ):
         choose_plan(values, torch.float32, Properties(132, 5000), "grid")
-    with pytest.raises(ValueError, match=r"kernel must be \"auto\""):
+    with pytest.raises(ValueError, match=r"kernel .*got 'team'"):
         choose_plan(values, torch.float32, H100, "team")
 
 
@@ -271,7 +271,7 @@ def test_patches_of_a_multilevel_solver_fit(gpu: Properties, dtype: torch.dtype)
     # not many more than it takes
     assert shared_bytes(plan, 0, 0) >= 0.3 * gpu.shared
     assert choose_plan(box_values((3, 3, 3)), dtype, gpu, levels=True).patches == 1
-    with pytest.raises(ValueError, match="kernel must be \"stream\" for Multilevel on a GPU, got 'block'"):
+    with pytest.raises(ValueError, match=r"kernel .*got 'block'"):
         choose_plan(values, dtype, gpu, "block", levels=True)
 
 
@@ -397,7 +397,7 @@ def test_a_gpu_that_can_be_used() -> None:
 
 def test_too_little_memory_is_a_sentence() -> None:
     check_free_memory(1000, 1000)
-    with pytest.raises(RuntimeError, match=r"step need 1,001 B of memory on the GPU and 1,000 B are free"):
+    with pytest.raises(RuntimeError, match=r"step need 1,001 B .*the GPU and 1,000 B are free"):
         check_free_memory(1001, 1000)
 
 

@@ -94,10 +94,10 @@ def test_names_of_fields_may_have_any_letters(tmp_path: Path) -> None:
 
 
 REFUSED: dict[str, tuple[str, dict[str, Any], type[Exception], str]] = {
-    "ending": ("a.pvd", {}, ValueError, r"path must end in \.vtu .* a\.pvd"),
+    "ending": ("a.pvd", {}, ValueError, r"path .*got a\.pvd"),
     "folder": ("none/a.vtu", {}, FileNotFoundError, "there is no folder"),
     "which": ("a.vtu", {"batch": 2}, ValueError, "environment=0"),
-    "no such": ("a.vtu", {"environment": 1}, IndexError, r"environment must lie in 0\.\.0, got 1"),
+    "no such": ("a.vtu", {"environment": 1}, IndexError, "environment .*got 1"),
     "nobody": ("a.vtu", {"batch": 0}, ValueError, "at least one environment"),
     "shape": ("a.vtu", {"point_data": {"f": torch.zeros(3)}}, ValueError, r"point_data\['f'\] must be \[1, 16"),
     "name": ("a.vtu", {"point_data": {"velocity": torch.zeros(16)}}, ValueError, "'velocity', which every file has"),
@@ -118,16 +118,16 @@ def test_what_is_refused_of_a_motion(tmp_path: Path) -> None:
     sim = two_bodies()
     track = sim.rollout(sim.rest_state(), 2)
     for states, options, words in (
-        (track, {"times": [1.0]}, r"times must be \[2\]"),
+        (track, {"times": [1.0]}, r"times .*got \[1\]"),
         ([], {}, "at least one record"),
-        ([sim.rest_state(1), sim.rest_state(2)], {}, r"one number of environments, got \[1, 2\]"),
+        ([sim.rest_state(1), sim.rest_state(2)], {}, r"states .*got \[1, 2\]"),
     ):
         with pytest.raises(ValueError, match=words):
             sim.write_vtu(tmp_path / "a.pvd", states, **options)
-    with pytest.raises(ValueError, match=r"must end in \.pvd"):
+    with pytest.raises(ValueError, match=r"path .*got a\.vtu"):
         sim.write_vtu(tmp_path / "a.vtu", track)
-    with pytest.raises(TypeError, match="states must be a State, a Track or a list"):
+    with pytest.raises(TypeError, match=r"states .*got Tensor"):
         sim.write_vtu(tmp_path / "a.vtu", track.positions)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match=r"state must be a State, .* got Tensor"):
+    with pytest.raises(TypeError, match=r"state .*got Tensor"):
         sim.write_vtu(tmp_path / "a.pvd", [track.state(), track.positions[1]])  # type: ignore[list-item]
     assert list(tmp_path.iterdir()) == []

@@ -31,22 +31,22 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
         (
             {"stiffness": torch.ones(3)},
             ValueError,
-            r"stiffness must be \[48\], .* got \[3\]; tetrahedra of the scene: 48",
+            r"stiffness must be \[48\], .* got \[3\]; .*scene: 48",
         ),
-        ({"stiffness": torch.ones(48) > 0}, TypeError, r"stiffness must hold real numbers, got torch\.bool"),
-        ({"stiffness": sparse}, TypeError, r"stiffness must be dense and have values, got torch\.sparse_coo on cpu"),
-        ({"stiffness": unreal}, TypeError, r"stiffness must be dense and have values, got torch\.strided on meta"),
-        ({"stiffness": 0.0}, ValueError, r"stiffness must be positive in torch\.float32, got 0\.0 at \[0\] \(48 in"),
-        ({"stiffness": 1e-60}, ValueError, r"stiffness must be positive in torch\.float32, got 0\.0 at \[0\]"),
-        ({"stiffness": math.inf}, ValueError, "stiffness must be finite in torch.float32, got inf at"),
-        ({"masses": masses}, ValueError, r"masses must be positive .*, got -0\.5 at \[4\] \(2 in all\)"),
-        ({"masses": masses.repeat(2, 1)}, ValueError, r"masses must be positive .*, got -0\.5 at \[0, 4\] \(4 in all"),
+        ({"stiffness": torch.ones(48) > 0}, TypeError, r"stiffness .*got torch\.bool"),
+        ({"stiffness": sparse}, TypeError, r"stiffness .*got torch\.sparse_coo on cpu"),
+        ({"stiffness": unreal}, TypeError, r"stiffness .*got torch\.strided on meta"),
+        ({"stiffness": 0.0}, ValueError, r"stiffness .* torch\.float32, got 0\.0 at \[0\] \(48 in"),
+        ({"stiffness": 1e-60}, ValueError, r"stiffness .* torch\.float32, got 0\.0 at \[0\]"),
+        ({"stiffness": math.inf}, ValueError, r"stiffness .* torch.float32, got inf at"),
+        ({"masses": masses}, ValueError, r"masses .*, got -0\.5 at \[4\] \(2 in all\)"),
+        ({"masses": masses.repeat(2, 1)}, ValueError, r"masses .*, got -0\.5 at \[0, 4\] \(4 in all"),
         ({"masses": math.nan}, ValueError, "masses must be finite .*, got nan at"),
         ({"gravity": -9.81}, ValueError, r"gravity must be \[3\], or with a batch in front, got one number, -9\.81$"),
         (
             {"planes": 1.0},
             ValueError,
-            r"planes must be \[1, 5\], or with a batch in front, got one number, 1; planes of the scene: 1",
+            r"planes must be \[1, 5\], or with a batch in front, got one number, 1; .*scene: 1",
         ),
         ({"spheres": torch.tensor(0.5)}, ValueError, r"spheres must be \[1, 8\], .*, got one number, 0\.5;"),
         ({"pin_targets": 0.0}, ValueError, r"pin_targets must be \[3, 3\], .*, got one number, 0;"),
@@ -55,28 +55,28 @@ def test_set_material_is_checked(sim: pd.Simulator) -> None:
             ValueError,
             r"pin_stiffness is 0 at hard pins.* pin_hard=False.*; at \[0\] \(2 in all\)",
         ),
-        ({"pin_stiffness": -1.0}, ValueError, "pin_stiffness must be >= 0, inf for pins that hold exactly, .*, got -1"),
-        ({"pin_stiffness": math.nan}, ValueError, "pin_stiffness must be >= 0, inf for pins that hold .*, got nan"),
+        ({"pin_stiffness": -1.0}, ValueError, r"pin_stiffness must be >= 0, .*, got -1"),
+        ({"pin_stiffness": math.nan}, ValueError, r"pin_stiffness must be >= 0, .*, got nan"),
         (
             {"pin_stiffness": math.inf, "pin_hard": [True, False, True]},
             ValueError,
-            r"pin_stiffness must be finite where pin_hard is False, got inf; at \[1\] \(1 in all\)",
+            r"pin_stiffness .* pin_hard is False, got inf; at \[1\] \(1 in all\)",
         ),
         ({"pin_hard": 1.0}, TypeError, r"pin_hard must be bool .*, got torch\.float32"),
-        ({"pin_hard": "yes"}, TypeError, "pin_hard must be a bool or a bool tensor, got 'yes'"),
-        ({"pin_hard": None}, TypeError, "pin_hard must be a bool or a bool tensor, got None"),
-        ({"pin_hard": [True, False]}, ValueError, r"pin_hard must be one bool, \[3\], .* got \[2\]; pins of the"),
+        ({"pin_hard": "yes"}, TypeError, r"pin_hard .*got 'yes'"),
+        ({"pin_hard": None}, TypeError, r"pin_hard .*got None"),
+        ({"pin_hard": [True, False]}, ValueError, r"pin_hard .*, \[3\], .* got \[2\]; pins of the"),
         (
             {"pin_hard": torch.ones(2, 3) > 0, "masses": torch.ones(3, 27)},
             ValueError,
-            "arrays must have one number of environments.*, got 3 environments in masses and 2 in pin_hard",
+            r"arrays .* environments.*, got 3 environments in masses and 2 in pin_hard",
         ),
         ({"gravity": (0.0, math.nan, 0.0)}, ValueError, "gravity must be finite .*, got nan"),
         ({"damping": -1.0}, ValueError, r"damping must be >= 0 in torch\.float32, got -1\.0$"),
         (
             {"planes": torch.tensor([[0.0, 2.0, 0.0, 0.0, 0.0]])},
             ValueError,
-            r"planes: the normal .* must be of unit length .*, got \[0\. 2\. 0\. 0\. 0\.\] at \[0\]",
+            r"planes: the normal .*, got \[0\. 2\. 0\. 0\. 0\.\] at \[0\]",
         ),
         ({"planes": torch.tensor([[0.0, 1.0, 0.0, 0.0, -1.0]])}, ValueError, r"planes: friction .* must be >= 0"),
         ({"spheres": torch.zeros(1, 8)}, ValueError, r"spheres: the radius .* must be positive"),
@@ -91,11 +91,11 @@ def test_a_state_dict_of_another_scene_is_refused_in_its_own_name() -> None:
     other = pd.Simulator(pd.Scene(solid, *(part for part in scene().parts if isinstance(part, pd.Gravity))), 1 / 60, 2)
     sim = small_simulator()
     before = [array.clone() for array in sim.material()]
-    with pytest.raises(ValueError, match=r"^Simulator\.load_state_dict: stiffness must be \[48\], .*, got \[6\]; tetr"):
+    with pytest.raises(ValueError, match=r"^Simulator\.load_state_dict: stiffness .*got \[6\]; tetr"):
         sim.load_state_dict(other.state_dict())
     assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
     two = {**sim.state_dict(), "masses": sim.masses.repeat(2, 1), "gravity": sim.gravity.repeat(3, 1)}
-    with pytest.raises(ValueError, match=r"^Simulator\.load_state_dict: arrays must have one number of environments"):
+    with pytest.raises(ValueError, match=r"^Simulator\.load_state_dict: arrays .*got 2 environments"):
         sim.load_state_dict(two)
 
 
@@ -104,9 +104,9 @@ def test_a_state_dict_is_loaded_whole_or_not_at_all(assign: bool) -> None:
     sim = small_simulator()
     before = [array.clone() for array in sim.material()]
     for wrong, kind, message in (
-        (torch.tensor(5.0), ValueError, r"stiffness must have 1 or 2 dimensions, got \[\]"),
-        (5.0, TypeError, "stiffness must be a tensor, got float"),
-        (before[0].numpy(), TypeError, "stiffness must be a tensor, got ndarray"),
+        (torch.tensor(5.0), ValueError, r"stiffness .*got \[\]"),
+        (5.0, TypeError, "stiffness .*got float"),
+        (before[0].numpy(), TypeError, "stiffness .*got ndarray"),
     ):
         whole = {**sim.state_dict(), "masses": 2.0 * sim.masses, "stiffness": wrong}
         with pytest.raises(kind, match=rf"^Simulator\.load_state_dict: {message}"):
@@ -165,7 +165,7 @@ def test_files_have_whole_arrays(name: str) -> None:
 
 def test_material_that_rounds_to_nothing_is_refused() -> None:
     thin = pd.Scene(pd.Solid(body().mesh, youngs=1e-60))
-    with pytest.raises(ValueError, match=r"^Simulator: stiffness must be positive in torch\.float32, got 0\.0 at"):
+    with pytest.raises(ValueError, match=r"^Simulator: stiffness .*got 0\.0 at"):
         pd.Simulator(thin)
     pd.Simulator(thin, iterations=1, dtype=torch.float64)
 
@@ -204,5 +204,5 @@ def test_what_is_no_material_is_refused(sim: pd.Simulator) -> None:
         with pytest.raises(TypeError, match="set_material: stiffness must be a number or a tensor, got"):
             sim.set_material(stiffness=value)  # type: ignore[arg-type]
     for loaded in (None, "file.pt", 3):
-        with pytest.raises(TypeError, match=r"load_state_dict: state_dict must be a mapping .*, got"):
+        with pytest.raises(TypeError, match=r"load_state_dict: state_dict .*mapping .*, got"):
             sim.load_state_dict(loaded)  # type: ignore[arg-type]

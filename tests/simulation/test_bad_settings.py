@@ -23,51 +23,51 @@ def sim() -> pd.Simulator:
 def test_settings_of_a_simulator_are_checked() -> None:
     parts = scene()
     for keywords, kind, message in (
-        ({"time_step": 0.0}, ValueError, r"time_step must be positive and finite \[s\], got 0"),
-        ({"time_step": math.inf}, ValueError, r"time_step must be positive and finite"),
-        ({"iterations": -1}, ValueError, r"iterations must be a whole number >= 0, got -1"),
-        ({"iterations": 2.5}, ValueError, r"iterations must be a whole number >= 0, got 2\.5"),
-        ({"time_step": "fast"}, ValueError, r"time_step must be positive and finite \[s\], got 'fast'"),
-        ({"time_step": "1"}, ValueError, r"time_step must be positive and finite \[s\], got '1'"),
-        ({"time_step": None}, ValueError, r"time_step must be positive and finite \[s\], got None"),
+        ({"time_step": 0.0}, ValueError, "time_step .*got 0"),
+        ({"time_step": math.inf}, ValueError, "time_step .*got inf"),
+        ({"iterations": -1}, ValueError, "iterations .*got -1"),
+        ({"iterations": 2.5}, ValueError, r"iterations .*got 2\.5"),
+        ({"time_step": "fast"}, ValueError, "time_step .*got 'fast'"),
+        ({"time_step": "1"}, ValueError, "time_step .*got '1'"),
+        ({"time_step": None}, ValueError, "time_step .*got None"),
         (
             {"time_step": 1e-20},
             ValueError,
-            r"time_step must lie within 1e-12 and 1e\+12 \[s\] in torch\.float32, got 1e-20",
+            "time_step .*got 1e-20",
         ),
-        ({"time_step": 1e13}, ValueError, r"time_step must lie within 1e-12 and 1e\+12 \[s\] in torch\.float32"),
+        ({"time_step": 1e13}, ValueError, r"time_step .*got 10000000000000\.0"),
         (
             {"time_step": 1e160, "dtype": torch.float64},
             ValueError,
-            r"must lie within 1e-100 and 1e\+100 \[s\] in torch\.fl",
+            r"time_step .*got 1e\+160",
         ),
-        ({"iterations": 2**40}, ValueError, r"iterations must be a whole number <= 1,000,000,000, got 1099511627776"),
-        ({"time_step": True}, ValueError, r"time_step must be positive and finite \[s\], got True"),
-        ({"tolerance": False}, ValueError, r"tolerance must lie in \[0, 1\), got False"),
-        ({"iterations": "many"}, ValueError, r"iterations must be a whole number >= 0, got 'many'"),
-        ({"iterations": math.nan}, ValueError, r"iterations must be a whole number >= 0, got nan"),
-        ({"iterations": True}, ValueError, r"iterations must be a whole number >= 0, got True"),
-        ({"batch": 0}, ValueError, r"batch must be a whole number >= 1, got 0"),
-        ({"batch": 1.5}, ValueError, r"batch must be a whole number >= 1, got 1\.5"),
-        ({"batch": "many"}, ValueError, r"batch must be a whole number >= 1, got 'many'"),
-        ({"tolerance": 1.0}, ValueError, r"tolerance must lie in \[0, 1\), got 1"),
-        ({"tolerance": -0.1}, ValueError, r"tolerance must lie in \[0, 1\)"),
-        ({"tolerance": math.nan}, ValueError, r"tolerance must lie in \[0, 1\), got nan"),
-        ({"tolerance": None}, ValueError, r"tolerance must lie in \[0, 1\), got None"),
-        ({"tolerance": "low"}, ValueError, r"tolerance must lie in \[0, 1\), got 'low'"),
+        ({"iterations": 2**40}, ValueError, "iterations .*got 1099511627776"),
+        ({"time_step": True}, ValueError, "time_step .*got True"),
+        ({"tolerance": False}, ValueError, "tolerance .*got False"),
+        ({"iterations": "many"}, ValueError, "iterations .*got 'many'"),
+        ({"iterations": math.nan}, ValueError, "iterations .*got nan"),
+        ({"iterations": True}, ValueError, "iterations .*got True"),
+        ({"batch": 0}, ValueError, "batch .*got 0"),
+        ({"batch": 1.5}, ValueError, r"batch .* >= 1, got 1\.5"),
+        ({"batch": "many"}, ValueError, "batch .*got 'many'"),
+        ({"tolerance": 1.0}, ValueError, "tolerance .*got 1"),
+        ({"tolerance": -0.1}, ValueError, r"tolerance .*got -0\.1"),
+        ({"tolerance": math.nan}, ValueError, "tolerance .*got nan"),
+        ({"tolerance": None}, ValueError, "tolerance .*got None"),
+        ({"tolerance": "low"}, ValueError, "tolerance .*got 'low'"),
         ({"dt": 0.01}, TypeError, r"^Simulator has no argument 'dt'; .*`time_step`"),
         (
             {"solver": "newton"},
             TypeError,
-            r"solver must be Jacobi, Chebyshev, Multilevel or .*'jacobi'.*, got 'newton'",
+            "solver .*got 'newton'",
         ),
         ({"device": "gpu"}, RuntimeError, "gpu"),
-        ({"dtype": "float32"}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got 'float32'"),
-        ({"dtype": torch.float16}, ValueError, r"dtype must be torch\.float32 or torch\.float64, got torch\.float16"),
+        ({"dtype": "float32"}, ValueError, "dtype .*got 'float32'"),
+        ({"dtype": torch.float16}, ValueError, r"dtype .*got torch\.float16"),
     ):
         with pytest.raises(kind, match=message):
             pd.Simulator(parts, **keywords)  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="scene must be a Scene, got Solid"):
+    with pytest.raises(TypeError, match=r"scene .*got Solid"):
         pd.Simulator(body())  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"patch_size must lie in 16\.\.8192"):
         compile_plan(parts.values(), patch_size=8)
@@ -79,13 +79,13 @@ def test_settings_that_are_replaced_are_checked() -> None:
     for value in ("a", None, -1, math.nan):
         with pytest.raises(ValueError, match=rf"time_step must be positive and finite \[s\], got {value!r}"):
             sim.time_step = value  # type: ignore[assignment]
-    with pytest.raises(ValueError, match=r'kernel must be "auto", "benchmark", .*, got \'foo\''):
+    with pytest.raises(ValueError, match=r"kernel .*got \'foo\'"):
         sim.kernel = "foo"
-    with pytest.raises(ValueError, match=r"iterations must be a whole number >= 0, got None"):
+    with pytest.raises(ValueError, match=r"iterations .*got None"):
         sim.iterations = None  # type: ignore[assignment]
-    with pytest.raises(ValueError, match=r"tolerance must lie in \[0, 1\), got None"):
+    with pytest.raises(ValueError, match=r"tolerance .*got None"):
         sim.tolerance = None  # type: ignore[assignment]
-    with pytest.raises(ValueError, match=r"set_material: stiffness must be of at least one environment, got \[0, "):
+    with pytest.raises(ValueError, match=r"set_material: stiffness .*got \[0, 48\]"):
         sim.set_material(stiffness=sim.stiffness.detach().expand(1, -1)[:0])
     assert (sim.iterations, sim.tolerance, sim.time_step, sim.kernel) == before
 
@@ -95,19 +95,19 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
     pin, soft = sim.scene.pins
     (sphere,) = sim.scene.spheres
     targets: list[tuple[Any, type[Exception], str]] = [
-        (torch.zeros(2, 3), ValueError, r"targets must be \[3, 3\], or that with a batch of 2 in front, got \[2, 3\]"),
-        (torch.zeros(5, 3, 3), ValueError, r"targets must be \[3, 3\]"),
-        (torch.zeros(3, 3).double(), TypeError, r"targets must be torch\.float32 on cpu, got torch\.float64 on cpu"),
+        (torch.zeros(2, 3), ValueError, r"targets .*got \[2, 3\]"),
+        (torch.zeros(5, 3, 3), ValueError, r"targets .*got \[5, 3, 3\]"),
+        (torch.zeros(3, 3).double(), TypeError, r"targets .*got torch\.float64 on cpu"),
         ({pin: torch.zeros(1, 3)}, ValueError, r"targets of a Pin must be \[2, 3\]"),
         ({soft: torch.zeros(3)}, ValueError, r"targets of a Pin must be \[1, 3\]"),
         ({sphere: torch.zeros(4)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\]"),
         ({sphere: torch.tensor(0.0)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\], .* got \[\]"),
         ({sphere: torch.zeros(3).long()}, TypeError, r"targets of a Sphere must be torch\.float32 .* got torch\.int64"),
-        ({sphere: (0, 0, 0)}, TypeError, r"targets of a Sphere must be a tensor of torch\.float32 on cpu, got tuple"),
-        ({sphere: np.zeros(3)}, TypeError, r"targets of a Sphere must be a tensor .*, got ndarray; torch\.as_tensor"),
-        ({pin: np.zeros((2, 3), np.float32)}, TypeError, r"targets of a Pin must be a tensor .*, got ndarray"),
-        ({pin: [[0.0, 0.0, 0.0]] * 2}, TypeError, r"targets of a Pin must be a tensor .*, got list"),
-        ({pin: None}, TypeError, r"targets of a Pin must be a tensor .*, got NoneType"),
+        ({sphere: (0, 0, 0)}, TypeError, r"targets of a Sphere .* torch\.float32 on cpu, got tuple"),
+        ({sphere: np.zeros(3)}, TypeError, r"targets of a Sphere .*, got ndarray; torch\.as_tensor"),
+        ({pin: np.zeros((2, 3), np.float32)}, TypeError, r"targets of a Pin .*, got ndarray"),
+        ({pin: [[0.0, 0.0, 0.0]] * 2}, TypeError, r"targets of a Pin .*, got list"),
+        ({pin: None}, TypeError, r"targets of a Pin .*, got NoneType"),
         (np.zeros((3, 3)), TypeError, r"targets must be a tensor or a mapping from parts to tensors, got ndarray"),
         ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, ValueError, r"this Sphere is not a Pin or Sphere of the scene"),
         ({sim.scene.solids[0]: torch.zeros(3)}, ValueError, r"this Solid is not a Pin or Sphere of the scene"),
@@ -121,16 +121,16 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
         with pytest.raises(ValueError, match=r'start must be "velocity"(, | or )"inertial"'):
             call()
     for steps, every, message in (
-        (-1, 1, "steps must be a whole number >= 0, got -1"),
-        (1.5, 1, "steps must be a whole number >= 0, got 1.5"),
-        (3, 0, "every must be a whole number >= 1, got 0"),
+        (-1, 1, r"steps .* >= 0, got -1"),
+        (1.5, 1, "steps .*got 1.5"),
+        (3, 0, "every .*got 0"),
     ):
         with pytest.raises(ValueError, match=message):
             sim.rollout(state, steps, every)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="first must be a whole number >= 0, got -1"):
+    with pytest.raises(ValueError, match=r"first .*got -1"):
         sim.rollout(state, 1, first=-1)
     for batch in (-1, 1.5):
-        with pytest.raises(ValueError, match="batch must be a whole number >= 0"):
+        with pytest.raises(ValueError, match=r"batch .*number >= 0"):
             sim.rest_state(batch)  # type: ignore[arg-type]
 
 
@@ -167,7 +167,7 @@ def test_forces_and_starts_are_checked(name: str, sim: pd.Simulator) -> None:
 
 @pytest.mark.parametrize("forces", [torch.zeros(4, 2, 27, 3), [torch.zeros(2, 27, 3)] * 4], ids=["tensor", "list"])
 def test_forces_of_every_step_are_a_function(forces: Any, sim: pd.Simulator) -> None:
-    message = r"forces must be .*, got (\[4, 2, 27, 3\]|list); .* pass a function of the step number"
+    message = r"forces must be .*, got (\[4, 2, 27, 3\]|list); .*number"
     with pytest.raises((TypeError, ValueError), match=message):
         sim.rollout(sim.rest_state(2), 4, forces=forces)
     with pytest.raises((TypeError, ValueError), match=r"forces must be .*, got (\[4, 2, 27, 3\]|list)$"):
@@ -176,11 +176,9 @@ def test_forces_of_every_step_are_a_function(forces: Any, sim: pd.Simulator) -> 
 
 def test_targets_of_every_step_are_a_function(sim: pd.Simulator) -> None:
     state, targets = sim.rest_state(2), torch.zeros(4, 2, 3, 3)
-    with pytest.raises(
-        ValueError, match=r"targets must be .*, got \[4, 2, 3, 3\]; .* pass a function of the step number"
-    ):
+    with pytest.raises(ValueError, match=r"targets must be .*, got \[4, 2, 3, 3\]; .*number"):
         sim.rollout(state, 4, targets=targets)
-    with pytest.raises(ValueError, match=r"targets must be .*, got \[4, 2, 3, 3\]$"):
+    with pytest.raises(ValueError, match=r"targets .*got \[4, 2, 3, 3\]$"):
         sim(state, targets=targets)
 
 
@@ -194,7 +192,7 @@ def test_what_is_no_info_is_refused(info: Any, sim: pd.Simulator) -> None:
 
 def test_records_that_are_not_there_are_refused(sim: pd.Simulator) -> None:
     state = sim.rest_state()
-    with pytest.raises(IndexError, match=r"Track\.state: the track has no record, steps // every is 0"):
+    with pytest.raises(IndexError, match=r"Track\.state: .*steps // every is 0"):
         sim.rollout(state, 0).state()
     track = sim.rollout(state, 2)
     for record in (2, -3):
@@ -231,8 +229,8 @@ def test_positions_of_energies_and_gradients_are_checked(
     for given, message in (
         (None, r"a State, positions and velocities \[B, 27, 3\], .* got NoneType"),
         (x.numpy(), r"a State, positions and velocities \[B, 27, 3\], .* got ndarray"),
-        (x.double(), r"torch\.float32 on cpu like the simulator, got torch\.float64"),
-        (x.half(), r"torch\.float32 on cpu like the simulator, got torch\.float16"),
+        (x.double(), r"torch\.float32 .*got torch\.float64"),
+        (x.half(), r"torch\.float32 .*got torch\.float16"),
         (x[0], r"\[B, 27, 3\], got \[27, 3\]"),
         (x[:, :5], r"\[B, 27, 3\], got \[2, 5, 3\]"),
     ):
@@ -241,7 +239,7 @@ def test_positions_of_energies_and_gradients_are_checked(
         if isinstance(given, torch.Tensor):
             with pytest.raises((TypeError, ValueError), match=f"^{name} must be {message}"):
                 call(sim, pd.State(given, given))
-    with pytest.raises(ValueError, match=r"velocities must be \[2, 27, 3\] like positions \(m/s\), got \[1, 27, 3\]"):
+    with pytest.raises(ValueError, match=r"velocities .*got \[1, 27, 3\]"):
         call(sim, pd.State(x, x[:1]))
     assert torch.equal(call(sim, pd.State(x, torch.zeros_like(x))), call(sim, x))
 
@@ -249,10 +247,10 @@ def test_positions_of_energies_and_gradients_are_checked(
 def test_step_gradient_does_not_broadcast(sim: pd.Simulator) -> None:
     one, two = sim.rest_state(1), sim.rest_state(2)
     for state, after, message in (
-        (two, one, r"after must be \[2, 27, 3\] like positions \(m\), got \[1, 27, 3\]"),
-        (one, two.positions, r"after must be \[1, 27, 3\] like positions \(m\), got \[2, 27, 3\]"),
-        (pd.State(two.positions, one.velocities), two, r"velocities must be \[2, 27, 3\] like positions"),
-        (pd.State(*(t[:, :5] for t in two)), two, r"state must be \[B, 27, 3\], got \[2, 5, 3\]"),
+        (two, one, r"after .*got \[1, 27, 3\]"),
+        (one, two.positions, r"after .*got \[2, 27, 3\]"),
+        (pd.State(two.positions, one.velocities), two, r"velocities .*got \[1, 27, 3\]"),
+        (pd.State(*(t[:, :5] for t in two)), two, r"state .*got \[2, 5, 3\]"),
     ):
         with pytest.raises(ValueError, match=message):
             sim.step_gradient(state, after)
@@ -262,16 +260,16 @@ def test_solvers_are_checked() -> None:
     for make, message in (
         (lambda: pd.Jacobi(relaxation=0.0), r"Jacobi\.relaxation must lie in \(0, 2\)"),
         (lambda: pd.Jacobi(relaxation=2.0), r"Jacobi\.relaxation must lie in \(0, 2\)"),
-        (lambda: pd.Jacobi(diagonal="full"), r"Jacobi\.diagonal must be one of 'weighted', 'plain', got 'full'"),
-        (lambda: pd.Chebyshev("fast"), r"Chebyshev\.schedule must be one of 'guarded', 'classic', got 'fast'"),
+        (lambda: pd.Jacobi(diagonal="full"), r"Jacobi\.diagonal .*got 'full'"),
+        (lambda: pd.Chebyshev("fast"), r"Chebyshev\.schedule .*got 'fast'"),
         (lambda: pd.Chebyshev("classic"), r"needs rho; torchpd\.estimate_rho"),
-        (lambda: pd.Chebyshev("classic", rho=1.0), r"Chebyshev\.rho must lie in \(0, 1\), got 1"),
-        (lambda: pd.Chebyshev("classic", rho=0.9, delay=-1), r"Chebyshev\.delay must be a whole number >= 0, got -1"),
-        (lambda: pd.Chebyshev("classic", rho=0.9, delay=1.5), r"Chebyshev\.delay must be a whole number"),
-        (lambda: pd.Chebyshev(rho=math.nan), r"Chebyshev\.rho must be finite"),
-        (lambda: pd.Chebyshev(relaxation=3.0), r"Chebyshev\.relaxation must lie in \(0, 2\)"),
-        (lambda: pd.Chebyshev(delay=5), r'Chebyshev\.delay must be None unless schedule="classic", got 5'),
-        (lambda: pd.Chebyshev(diagonal="plain"), r'Chebyshev\.diagonal must be "weighted" when guarded'),
+        (lambda: pd.Chebyshev("classic", rho=1.0), r"Chebyshev\.rho .*got 1"),
+        (lambda: pd.Chebyshev("classic", rho=0.9, delay=-1), r"Chebyshev\.delay .*got -1"),
+        (lambda: pd.Chebyshev("classic", rho=0.9, delay=1.5), r"Chebyshev\.delay .*got 1\.5"),
+        (lambda: pd.Chebyshev(rho=math.nan), r"Chebyshev\.rho .*got nan"),
+        (lambda: pd.Chebyshev(relaxation=3.0), r"Chebyshev\.relaxation .*got 3\.0"),
+        (lambda: pd.Chebyshev(delay=5), r"Chebyshev\.delay .*got 5"),
+        (lambda: pd.Chebyshev(diagonal="plain"), r'Chebyshev\.diagonal .*got "plain"'),
     ):
         with pytest.raises(ValueError, match=message):
             make()  # type: ignore[no-untyped-call]

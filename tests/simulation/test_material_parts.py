@@ -72,22 +72,22 @@ def test_what_they_cannot_be_is_said_and_changes_nothing() -> None:
     for arrays, kind, message in (
         ({"friction": -0.1}, ValueError, r"set_material: planes: friction \(column 4\) must be >= 0 .* -0\.1\] at"),
         ({"radius": 0.0}, ValueError, r"set_material: spheres: the radius \(column 3\) must be positive"),
-        ({"height": float("nan")}, ValueError, "set_material: planes must be finite"),
+        ({"height": float("nan")}, ValueError, "set_material: planes .*got nan"),
         (
             {"friction": torch.ones(3)},
             ValueError,
-            r"friction must be \[2\], or with a batch in front, got \[3\]; grounds and spheres of the scene: 2",
+            r"friction .*got \[3\]",
         ),
         (
             {"radius": torch.ones(1, 1, 1)},
             ValueError,
-            r"radius must be \[1\], or with a batch in front, got \[1, 1, 1\]",
+            r"radius .*got \[1, 1, 1\]",
         ),
-        ({"height": torch.zeros(4, 1)}, ValueError, "height must have the 3 environments of planes, got 4"),
-        ({"friction": "much"}, TypeError, "friction must be a number or a tensor, got 'much'"),
-        ({"friction": torch.ones(2) > 0}, TypeError, r"friction must hold real numbers, got torch\.bool"),
-        ({"friction": 0.1, "planes": sim.planes}, TypeError, "give friction or planes .*column 4.*, got both"),
-        ({"height": 0.1, "gravity": torch.ones(2)}, ValueError, r"gravity must be \[3\]"),
+        ({"height": torch.zeros(4, 1)}, ValueError, "height .*got 4"),
+        ({"friction": "much"}, TypeError, "friction .*got 'much'"),
+        ({"friction": torch.ones(2) > 0}, TypeError, r"friction .*got torch\.bool"),
+        ({"friction": 0.1, "planes": sim.planes}, TypeError, r"give .*column 4.*, got both"),
+        ({"height": 0.1, "gravity": torch.ones(2)}, ValueError, r"gravity .*got \[2\]"),
     ):
         with pytest.raises(kind, match=message):
             sim.set_material(**arrays)  # type: ignore[arg-type]

@@ -113,9 +113,7 @@ def test_originals_of_another_shape_are_refused_before_anything_is_loaded() -> N
     before = [array.clone() for array in sim.material()]
     for wrong in (torch.tensor(5.0), 5.0, sim.stiffness.detach().repeat(2, 1)):
         whole = {**sim.state_dict(), "masses": 2.0 * sim.masses, "parametrizations.stiffness.original": wrong}
-        with pytest.raises(
-            ValueError, match=r"load_state_dict: parametrizations\.stiffness\.original must be a tensor \[48\]"
-        ):
+        with pytest.raises(ValueError, match=r"load_state_dict: parametrizations\.stiffness\.original .*tensor \[48\]"):
             sim.load_state_dict(whole)
         assert all(torch.equal(one, other) for one, other in zip(before, sim.material(), strict=True))
 
@@ -132,7 +130,7 @@ def test_set_material_goes_through_the_right_inverse(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("how", "batch", "said"),
     [
-        (Exponential(), 2, "stiffness must keep the shape .*, got"),
+        (Exponential(), 2, r"stiffness .*got \[2, 18\]"),
         (OneWay(), 0, "parametrization OneWay without a right_inverse"),
     ],
 )
@@ -181,7 +179,7 @@ def test_all_of_them_or_none() -> None:
     with torch.no_grad():
         parametrize.register_parametrization(sim, "masses", Overflowing())
     before = [array.detach().clone() for array in sim.material()]
-    with pytest.raises(ValueError, match="masses must be a value of its parametrization Overflowing"):
+    with pytest.raises(ValueError, match=r"masses .*parametrization Overflowing"):
         sim.set_material(stiffness=7e4, masses=torch.full_like(sim.masses, 1e3))
     assert all(torch.equal(now, then) for now, then in zip(sim.material(), before, strict=True))
 

@@ -205,9 +205,7 @@ def test_a_change_of_precision_is_refused_until_it_is_made_anew() -> None:
     pieces = pd.RigidPieces(sim)
     sim.double()
     wide = pd.State(*(part.double() for part in state))
-    with pytest.raises(
-        RuntimeError, match=r"made for torch\.float32 on cpu, .* torch\.float64 on cpu now; call prepare"
-    ):
+    with pytest.raises(RuntimeError, match=r"made for torch\.float32 on cpu, .* torch\.float64 .*prepare"):
         pieces.step(wide, 2)
     pieces.prepare()
     assert same_bits(pieces.step(wide, 2), pd.RigidPieces(sim).step(wide, 2))
@@ -284,7 +282,7 @@ def test_pieces_are_counted_before_they_are_split(monkeypatch: pytest.MonkeyPatc
     body = pd.Solid(mesh, youngs=1e5)
     sim = pd.Simulator(pd.Scene(body, pd.Pin(body, np.arange(8000) == 3)), iterations=8, progress=False)
     monkeypatch.setattr(stiff_pieces, "_split", refuse)
-    with pytest.raises(ValueError, match=r"1 to 256 .* got 2000 stiffer than 0 Pa, 1 of them with hard pins;"):
+    with pytest.raises(ValueError, match=r"1 to 256 .*got 2000 .*1 of them"):
         pd.RigidPieces(sim, stiffer_than=0.0)
 
 
@@ -292,7 +290,7 @@ def test_what_does_not_fit_into_memory_is_refused(monkeypatch: pytest.MonkeyPatc
     sim, _ = blocks("slabs")
     needed = 4 * 5 * sim.vertices * 8
     monkeypatch.setattr(stiff_pieces, "_memory", lambda device: needed - 1)
-    with pytest.raises(ValueError, match=rf"5 pieces of 525 vertices need {needed:,} B of memory, and cpu has"):
+    with pytest.raises(ValueError, match=rf"5 pieces .*{needed:,} B .*{needed - 1:,} B"):
         pd.RigidPieces(sim)
     monkeypatch.setattr(stiff_pieces, "_memory", lambda device: needed)
     pd.RigidPieces(sim)
@@ -307,7 +305,7 @@ def test_bad_arguments_are_refused_with_name_contract_and_what_came() -> None:
     single = state.positions.float()
     contract = r"must be \[1, 525, 3\], torch\.float64 on cpu like state and simulator"
     calls: list[tuple[Any, type[Exception], str]] = [
-        (lambda: pieces.move(two, state.positions), ValueError, r"positions must be \[2, 525, 3\].*got \[1, 525, 3\]"),
+        (lambda: pieces.move(two, state.positions), ValueError, r"positions .*got \[1, 525, 3\]"),
         (lambda: pieces.move(state, two.positions), ValueError, rf"^positions {contract}, got \[2, 525, 3\]"),
         (lambda: pieces.move(state, single), TypeError, rf"^positions {contract}, got torch\.float32 on cpu"),
         (lambda: pieces.move(state, 3), TypeError, rf"^positions {contract}, got int"),
@@ -318,21 +316,21 @@ def test_bad_arguments_are_refused_with_name_contract_and_what_came() -> None:
             (lambda call=call, bad=bad: call(bad), kind, message)
             for call in (lambda bad: pieces.step(bad, 2), lambda bad: pieces.move(bad, state.positions))
             for bad, kind, message in (
-                (3, TypeError, r"state must be a State, positions and velocities \[B, 525, 3\], got int"),
-                (state.positions, TypeError, "state must be a State, .*got Tensor"),
+                (3, TypeError, r"state .* State, positions and velocities \[B, 525, 3\], got int"),
+                (state.positions, TypeError, "state .*got Tensor"),
                 (pd.State(single, single), TypeError, rf"state\.positions {contract}, got torch\.float32 on cpu"),
                 (pd.State(state[0][0], state[1][0]), ValueError, rf"state\.positions {contract}, got \[525, 3\]"),
                 (pd.State(state[0][:, 1:], state[1]), ValueError, rf"state\.positions {contract}, got \[1, 524, 3\]"),
                 (pd.State(state[0], two[1]), ValueError, rf"state\.velocities {contract}, got \[2, 525, 3\]"),
             )
         ),
-        (lambda: pieces.step(state, 0), ValueError, "rounds must be a whole number >= 1, got 0"),
+        (lambda: pieces.step(state, 0), ValueError, "rounds .*got 0"),
         (lambda: pieces.step(state, 2, state.positions), TypeError, "positional argument"),
         (lambda: pieces.move(state, state.positions, None), TypeError, "positional argument"),
         (lambda: pd.RigidPieces(sim, 1e6), TypeError, "positional argument"),
-        (lambda: pd.RigidPieces(3), TypeError, "RigidPieces: sim must be a Simulator, got int"),
+        (lambda: pd.RigidPieces(3), TypeError, "RigidPieces: sim .*got int"),
         (lambda: pd.RigidPieces(sim, stiffer_than=-1.0), ValueError, r"RigidPieces\.stiffer_than must be >= 0"),
-        (lambda: pd.RigidPieces(sim, stiffer_than=np.nan), ValueError, r"RigidPieces\.stiffer_than must be finite"),
+        (lambda: pd.RigidPieces(sim, stiffer_than=np.nan), ValueError, r"RigidPieces\.stiffer_than .*got nan"),
         (
             lambda: pd.RigidPieces(copy.deepcopy(sim).to("meta")),
             RuntimeError,
@@ -349,7 +347,7 @@ def test_bad_arguments_are_refused_with_name_contract_and_what_came() -> None:
 def test_scenes_without_pieces_are_refused_with_the_numbers() -> None:
     for kind, span in (("none", "10000 to 10000"), ("slabs", "10000 to 500000")):
         sim, _ = blocks(kind, contrast=50.0)
-        message = f"stiffness ratio of 100, and the elements have {span} Pa; give stiffer_than"
+        message = f"stiffer_than .*100, .*{span} Pa; give stiffer_than"
         with pytest.raises(ValueError, match=message):
             pd.RigidPieces(sim)
     pieces = pd.RigidPieces(sim, stiffer_than=2e4)

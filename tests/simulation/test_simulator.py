@@ -166,7 +166,7 @@ def test_kernel_changes_nothing_on_the_cpu(dtype: torch.dtype) -> None:
     state = moving(sim)
     for kernel in KERNELS:
         assert same_bits(simulate(dtype, kernel=kernel)(state), sim(state))
-    refusal = 'kernel must be "auto", "benchmark", "block", "cluster", "grid" or "stream", got \'warp\''
+    refusal = "kernel .*got 'warp'"
     with pytest.raises(ValueError, match=refusal):
         simulate(dtype, kernel="warp")
 
@@ -210,10 +210,10 @@ def test_values_and_meta_are_not_mixed() -> None:
     sim = simulate(torch.float32)
     state = moving(sim)
     shapes = state.to("meta")
-    with pytest.raises(TypeError, match=r"state must be torch\.float32 on cpu like the simulator, got .* on meta"):
+    with pytest.raises(TypeError, match=r"state .*got .* on meta"):
         sim(shapes)
     for call in (sim, sim.step_, lambda state: sim.rollout(state, 2)):
-        with pytest.raises(TypeError, match=r"velocities must be torch\.float32 on cpu .*, got torch\.float32 on meta"):
+        with pytest.raises(TypeError, match=r"velocities .*got torch\.float32 on meta"):
             call(pd.State(state.positions, shapes.velocities))
     stiffness = {"stiffness": sim.stiffness.to("meta")}
     with pytest.raises(RuntimeError, match=r'torchpd::step: .* on cpu and some on "meta"'):
@@ -305,9 +305,9 @@ def test_states_of_some_environments_are_replaced() -> None:
         assert torch.equal(part[done], mine[done])
         assert torch.equal(part[~done], theirs[~done])
     for wrong in (torch.tensor([True]), done.float(), done[None]):
-        with pytest.raises(ValueError, match=r"State.where: condition must be bool \[3\], one for each"):
+        with pytest.raises(ValueError, match=r"State.where: condition .*bool \[3\], one for each"):
             new.where(wrong, old)
-    with pytest.raises(TypeError, match=r"State.where: condition must be a bool tensor, got list"):
+    with pytest.raises(TypeError, match=r"State.where: condition .*got list"):
         new.where([True, False, True], old)  # type: ignore[arg-type]
     for other, message in (
         (
@@ -315,8 +315,8 @@ def test_states_of_some_environments_are_replaced() -> None:
             r"other must have positions \[3, 45, 3\], or those of one .*, got \[2, 45, 3\]",
         ),
         (pd.State(old.positions, old.velocities[:2]), r"other must have velocities .*, got \[2, 45, 3\]"),
-        (old.to(torch.float64), r"other must have positions torch\.float32 on cpu, got torch\.float64 on cpu"),
-        (old.positions, "other must be a State, got Tensor"),
+        (old.to(torch.float64), r"other .* torch\.float32 on cpu, got torch\.float64 on cpu"),
+        (old.positions, r"other .* State, got Tensor"),
     ):
         with pytest.raises((TypeError, ValueError), match=f"^State.where: {message}"):
             new.where(done, other)
@@ -327,9 +327,7 @@ def test_states_of_some_environments_are_replaced() -> None:
 def test_a_time_step_must_do_in_another_precision() -> None:
     sim = simulate(torch.float64)
     sim.time_step = 1e-50
-    with pytest.raises(
-        ValueError, match=r"time_step must lie within 1e-12 and 1e\+12 \[s\] in torch\.float32, got 1e-50"
-    ):
+    with pytest.raises(ValueError, match=r"time_step .*got 1e-50"):
         sim.float()
     assert sim.dtype == torch.float64
     sim(sim.rest_state())

@@ -101,7 +101,7 @@ def test_a_rest_shape_is_not_learned(learned: str) -> None:
     else:
         calls = [lambda: torch.func.functional_call(sim, given, (state,))]
     for call in calls:
-        with pytest.raises(ValueError, match="rest_positions must not require a gradient"):
+        with pytest.raises(ValueError, match=r"rest_positions .*gradient"):
             call()
     with torch.no_grad():
         sim(state)
@@ -111,7 +111,7 @@ def test_a_rest_shape_that_was_changed_is_refused() -> None:
     sim = simulator()
     state = sim.rest_state()
     larger = {"rest_positions": 1.2 * sim.rest_positions}
-    message = "rest_positions must be those of the scene"
+    message = r"rest_positions .*scene"
     with pytest.raises(ValueError, match=message):
         torch.func.functional_call(sim, larger, (state,))
     sim(state)

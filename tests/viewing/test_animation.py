@@ -171,15 +171,15 @@ def test_missing_packages_say_what_to_install(
 
 def test_bad_requests_are_named(tmp_path: Path) -> None:
     frames, triangles = _motion(2)
-    with pytest.raises(ValueError, match=r"path must end in \.usdc, .*, got motion\.fbx"):
+    with pytest.raises(ValueError, match=r"path .*got motion\.fbx"):
         write_surface(tmp_path / "motion.fbx", frames, triangles, frames_per_second=1.0)
     with pytest.raises(ValueError, match="frames_per_second > 0"):
         write_surface(tmp_path / "motion.glb", frames, triangles, frames_per_second=0.0)
-    with pytest.raises(ValueError, match=r"path must end in \.gif, \.mp4"):
+    with pytest.raises(ValueError, match=r"path .*got film\.avi"):
         write_film(tmp_path / "film.avi", _film(1, 16, 32), frames_per_second=1.0)
     with pytest.raises(ValueError, match="all of one size"):
         write_film(tmp_path / "film.gif", [], frames_per_second=1.0)
-    with pytest.raises(ValueError, match="frames_per_second must be positive"):
+    with pytest.raises(ValueError, match=r"frames_per_second .*got -1\.0"):
         write_film(tmp_path / "film.gif", _film(1, 16, 32), frames_per_second=-1.0)
 
 

@@ -131,17 +131,17 @@ def test_grain_is_filtered(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_bad_requests_are_named() -> None:
     vertices, triangles = _ball((0.0, 0.5, 0.0), 0.5)
-    with pytest.raises(ValueError, match="elevation must lie between"):
+    with pytest.raises(ValueError, match=r"elevation .*got 90\.0"):
         frame_camera(vertices, elevation=90.0)
-    with pytest.raises(ValueError, match="at least one point"):
+    with pytest.raises(ValueError, match=r"points .*got none"):
         frame_camera(np.zeros((0, 3)))
-    with pytest.raises(ValueError, match=r"frames must be \[n, n, 3\]"):
+    with pytest.raises(ValueError, match=r"frames .*got \[1, 2, 2\]"):
         Studio(np.zeros((2, 2)), triangles)
     with pytest.raises(ValueError, match="size and samples"):
         Studio(vertices, triangles, samples=0)
-    with pytest.raises(ValueError, match=r"vertices must be \[162, 3\]"):
+    with pytest.raises(ValueError, match=r"vertices .*got \[161, 3\]"):
         Studio(vertices, triangles).render(vertices[:-1])
     with pytest.raises(ValueError, match="all of one size"):
         contact_sheet([])
-    with pytest.raises(ValueError, match="one per image"):
+    with pytest.raises(ValueError, match=r"captions .*got 2"):
         contact_sheet([np.zeros((4, 4, 3), dtype=np.uint8)], captions=["a", "b"])

@@ -68,10 +68,10 @@ def test_normals_face_an_eye_that_sees_their_triangles() -> None:
 @pytest.mark.parametrize(
     ("vertices", "triangles", "message"),
     [
-        ([[0.0, 0, 0]], [[0, 1, 2]], r"triangles must lie in 0\.\.0, got 0\.\.2"),
-        ([[0.0, 0, np.nan]], [[0, 0, 0]], "vertices must be finite"),
-        ([[0.0, 0, 0]], [[0.0, 0.0, 0.0]], "triangles must be integers"),
-        ([[0.0, 0]], [[0, 0, 0]], r"vertices must be \[n, 3\]"),
+        ([[0.0, 0, 0]], [[0, 1, 2]], r"triangles .*got 0\.\.2"),
+        ([[0.0, 0, np.nan]], [[0, 0, 0]], "vertices .*got nan"),
+        ([[0.0, 0, 0]], [[0.0, 0.0, 0.0]], r"triangles .*got float64 \[1, 3\]"),
+        ([[0.0, 0]], [[0, 0, 0]], r"vertices .*got \[1, 2\]"),
     ],
 )
 def test_bad_surfaces_are_named(vertices: list[list[float]], triangles: list[list[int]], message: str) -> None:
