@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from device_plans import box_values
 from programs import ROOT
 
+import torchpd as pd
 from torchpd.common.gpu import H100, Properties
 from torchpd.plan import Plan, kernel_benchmark, kernel_costs
 from torchpd.plan.kernel_choice import choose_plan, shared_bytes
@@ -118,16 +120,18 @@ def test_benchmark_takes_the_quickest_of_the_kernels_that_fit(monkeypatch: pytes
     milliseconds = {"block": 3.0, "cluster": math.inf, "grid": 2.0, "stream": 9.0}
     timed = []
 
-    def time(step: object, plan: Plan) -> float:
-        timed.append(plan.kernel)
-        return milliseconds[str(plan.kernel)]
+    def time(prepare: partial[Any]) -> float:
+        timed.append(prepare.args[0].kernel)
+        return milliseconds[timed[-1]]
 
     monkeypatch.setattr(kernel_benchmark, "_milliseconds", time)
-    values = box_values((5, 5, 5))
+    monkeypatch.setattr(torch.cuda, "get_device_name", str)
+    sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.box((1, 1, 1), (5, 5, 5)), 1e5)), progress=False)
 
     def chosen(batch: int) -> Plan:
-        pick = partial(kernel_benchmark.fastest_plan, key=batch, step=lambda plan: lambda: None)
-        return choose_plan(values, torch.float32, H100, "benchmark", batch=batch, fastest=pick)
+        scene = replace(sim.compiled, batch=batch)
+        pick = partial(kernel_benchmark.fastest_plan, scene=scene, dtype=torch.float32, device=torch.device("cuda"))
+        return choose_plan(scene.scene.values(), torch.float32, H100, "benchmark", batch=batch, fastest=pick)
 
     plan = chosen(16)
     assert plan.kernel == "grid"

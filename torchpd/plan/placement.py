@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from ..ops.diagonal import pinned_vertices
 from ..scene.solvers import Multilevel
 from .compiled import CompiledScene
 from .cpu_plan import Plan, compile_plan, with_loose_components
-from .kernel_benchmark import benchmark_steps, fastest_plan
+from .kernel_benchmark import fastest_plan
 from .kernel_choice import choose_plan
 from .material import material_of, material_rows
 from .preconditioner import (
@@ -103,7 +104,7 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
     return choose_plan(
         values, dtype, properties_of(device), compiled.kernel,
         levels=isinstance(compiled.solver, Multilevel), batch=compiled.batch, progress=compiled.progress,
-        fastest=lambda plans: fastest_plan(plans, *benchmark_steps(compiled, dtype, device)),
+        fastest=partial(fastest_plan, scene=compiled, dtype=dtype, device=device),
     )  # fmt: skip
 
 
