@@ -1,6 +1,6 @@
-// The ops of a step's adjoint on either device. Of a Backend, beside what ops.h asks for: `adjoint_system`,
-// `contact_gradients`, `adjoint_result` and `vertex_sum`, which run a call; and `recording(like)`, whether what is done is recorded for later,
-// where nobody can ask what comes out.
+// The ops of a step's adjoint on either device. Beside the functions of binding/ops.h, a Backend runs a call by
+// `adjoint_system`, `contact_gradients`, `adjoint_result` and `vertex_sum`. `recording(like)` says whether work is
+// only recorded for later, so that its results cannot be read.
 #pragma once
 #include "binding/material_gradients.h"
 
@@ -54,10 +54,12 @@ inline void check_step_taken(const AdjointTensors& t, double time_step) {
   CheckSetting::time_step(time_step);
 }
 
-// The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
-// a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3], of one that sticks to a ball
-// times how far it goes as its start does, whether friction holds it [batch, vertices], and what it slides along [batch,
-// vertices, 5, 3], else of no environments.
+// The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1,
+// vertices]. A scene with contacts adds three arrays; else these have no environments:
+//   projector [batch, vertices, 3, 3]   off the normals that hold a vertex; if it sticks to a sphere, times its motion per
+//                                       motion of its start
+//   stuck [batch, vertices]             whether friction holds it
+//   sliding [batch, vertices, 5, 3]     its vectors of sliding friction, see Slide
 template <class Backend>
 AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_velocities,
                               const Tensor& after, const Tensor& positions,
@@ -71,7 +73,7 @@ AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_v
              : adjoint_system_typed<Backend, double>(tensors, time_step);
 }
 
-// Of a scene with contacts also what they let through of what vertices that friction holds pass on, dL/dx' + dL/dv' / h - K l.
+// Only with contacts: the part of dL/dx' + dL/dv' / h - K l that vertices held by friction pass to their start.
 struct PassedOn {
   OptionalTensor grad_positions, elastic, projector, stuck, sliding;
 };
@@ -117,7 +119,7 @@ Outputs adjoint_result_typed(const ResultTensors& t, double time_step) {
   return {x, before, out};
 }
 
-// Gradients for positions and velocities before a step, and the multiplier, of which no number is left where the error is none.
+// Gradients for positions and velocities before a step, and the multiplier. All are NaN where the error is NaN.
 template <class Backend>
 Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tensor& grad_velocities,
                        at::TensorList material, const OptionalTensor& grad_positions,
@@ -176,13 +178,13 @@ struct AdjointSystem {
   OptionalTensor projector, sliding;  // with contacts
 };
 
-// The multiplier, and of every environment the relative residuals of the symmetric system, and of that with friction (solver/
-// friction.h), 0 where nothing slides; the latter undefined without contacts.
+// The multiplier, and relative residuals of every environment: of the symmetric system, and of the one with friction
+// (solver/adjoint/friction.h). The latter is 0 where no vertex slides, and undefined without contacts.
 struct Solved {
   Tensor solution, error, friction;
 };
 
-// By the iterations of conjugate_gradients_ and those of friction, as many as it takes.
+// Iterates conjugate_gradients_, then the friction solve, until all environments have ended.
 template <class Backend>
 Solved iterate(const Tensor& positions, const AdjointSystem& s, at::TensorList material,
                at::TensorList plan, double tolerance) {
@@ -214,7 +216,7 @@ std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Te
           sliding ? at::maximum(found.error, found.friction) : found.error.contiguous()};
 }
 
-// The solution with what stands in where there is none, and the warnings: torchpd/ops/adjoint.py.
+// The solution with the fallback for failed environments, and the warnings: torchpd/adjoint.py.
 inline Tensor mend(const AdjointTensors& t, const AdjointSystem& s, double time_step,
                    const Solved& found) {
   static const auto op =
@@ -227,8 +229,8 @@ inline Tensor mend(const AdjointTensors& t, const AdjointSystem& s, double time_
                  t.material, t.plan, time_step);
 }
 
-// Whether a solve of any environment has failed. One copy, which waits for a GPU, and takes less than kernels that make one number
-// of it.
+// Whether the solve of any environment has failed. One copy waits for a GPU, and takes less time than kernels that
+// reduce it to one number.
 inline bool some_failed(const Solved& found, double tolerance) {
   const Tensor errors =
       found.friction.defined() ? at::cat({found.error, found.friction}) : found.error;
@@ -238,20 +240,20 @@ inline bool some_failed(const Solved& found, double tolerance) {
                      [&](double e) { return e > adjoint_failed * tolerance; });
 }
 
-// The multiplier, and its relative residual of every environment.
+// The multiplier, and its relative residual for every environment.
 template <class Backend>
 std::tuple<Tensor, Tensor> solve(const AdjointTensors& t, const AdjointSystem& s,
                                  double time_step) {
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
   const Solved found = iterate<Backend>(t.after, s, t.material, t.plan, tolerance);
-  // a recording cannot ask, and does all of it
+  // a recording cannot read results, and does all of it
   const bool mends = Backend::recording(t.after) || some_failed(found, tolerance);
   return {mends ? mend(t, s, time_step, found) : found.solution, found.error};
 }
 
 using Wanted =
-    std::optional<c10::List<bool>>;  // of every array of the material, whether its gradient is
+    std::optional<c10::List<bool>>;  // whether the gradient of each array of the material is wanted
 
 inline void check_wanted(const Wanted& wanted, std::size_t arrays, const char* op) {
   TORCH_CHECK_VALUE(!wanted || wanted->size() == arrays, op, ": wanted must say of each of the ",
@@ -259,8 +261,8 @@ inline void check_wanted(const Wanted& wanted, std::size_t arrays, const char* o
                     wanted ? wanted->size() : 0, " numbers");
 }
 
-// The adjoint of a step: gradients for positions, velocities, forces [batch, vertices, 3], then for the wanted arrays of the
-// material, else all; what nobody wants costs nothing.
+// The adjoint of a step: gradients for positions, velocities and forces [batch, vertices, 3], then for the `wanted`
+// arrays of the material, or all. Gradients that are not wanted cost nothing.
 template <class Backend>
 std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
                              const Tensor& after, const Tensor& positions, const Tensor& velocities,

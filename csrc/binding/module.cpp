@@ -1,4 +1,4 @@
-// `torchpd._C`: mesh work on NumPy arrays, the tables, what was built. Loading it also registers the ops.
+// `torchpd._C`: mesh work on NumPy arrays, the tables, and how it was built. Loading it also registers the ops.
 #include "binding/settings.h"
 #include "cpu/dispatch.h"
 #include "cuda/common/launch.h"
@@ -30,7 +30,7 @@ using Doubles = py::array_t<double, py::array::c_style>;
 using Numbers = py::array_t<std::int32_t, py::array::c_style>;
 using Indices = py::array_t<std::int64_t, py::array::c_style>;
 
-// Hands the numbers over to NumPy without a copy.
+// Passes the numbers to NumPy without a copy.
 template <class T>
 py::array_t<T> as_array(std::vector<T>& numbers, py::ssize_t width) {
   auto* owned = new std::vector<T>(std::move(numbers));
@@ -91,7 +91,7 @@ py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_siz
   return arrays;
 }
 
-// What a cluster wants beside: a vertex for every patch, and tetrahedra at every vertex.
+// A cluster's additional requirements: a vertex for every patch, and tetrahedra at every vertex.
 void check_cluster(std::int64_t vertices, const Indices& tets, int patches) {
   const std::int64_t most = std::min<std::int64_t>(vertices, pd::most_cluster_blocks);
   if (patches > most)
@@ -241,7 +241,7 @@ py::dict build_info() {
   return info;
 }
 
-// Memory that the current CUDA device wants for a step, of which the counts are known.
+// Memory that a step needs on the current CUDA device, for a plan of given counts.
 template <class T>
 std::int64_t bytes_of([[maybe_unused]] const pd::DeviceStep<T>& step) {
 #if defined(TORCHPD_CUDA)
@@ -270,7 +270,7 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes, int sc
 
 unsigned long main_thread = 0;
 
-// What Python does between two of its own instructions: handlers of signals run, that of Ctrl-C raises KeyboardInterrupt.
+// Runs pending signal handlers, as Python does between two instructions; that of Ctrl-C raises KeyboardInterrupt.
 // Only the main thread has any.
 void run_signal_handlers() {
   if (PyThread_get_thread_ident() != main_thread) return;
@@ -281,7 +281,7 @@ void run_signal_handlers() {
   if (raised) throw *raised;
 }
 
-// float32 multiply-adds per second that one thread of this processor does
+// float32 multiply-adds per second of one thread of this processor
 double multiply_adds_per_second() {
   float seconds = 0;
   std::int64_t operations = 0;

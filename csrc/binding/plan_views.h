@@ -1,4 +1,4 @@
-// Tensors to views: the arrays of a plan and of a material, and how long they have to be.
+// Tensors to views: the arrays of a plan and of a material, and their lengths.
 #pragma once
 #include "binding/checks.h"
 #include "views/shared_memory.h"
@@ -92,7 +92,7 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   return levels;
 }
 
-// What the arrays hold is trusted; how long they are is not.
+// Lengths of the arrays are checked; their contents are trusted.
 template <class T>
 Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   constexpr int with_levels = plan_arrays + level_arrays;
@@ -124,7 +124,7 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   count.patch_end = plan.patches + 1;
   count.slot = plan.slots;
   count.shared_end = plan.shared + 1;
-  // every slot that does not hold an interior vertex of its patch holds a shared one
+  // every slot without an interior vertex of its patch holds a shared one
   count.shared_slot = plan.slots - (plan.vertices - plan.shared);
   int at = 0;
   using real = T;
@@ -152,7 +152,7 @@ constexpr int device_plan_arrays = 0
     ;
 #undef X
 
-// Where part_slot stands in the table: how many vertices can move freely is not among the counts.
+// The place of part_slot in the table: the counts lack the number of free vertices.
 #define X(name, type, width, rows, meaning) name,
 enum class DevicePlanArray : int {
 #include "views/gpu_plan.def"
@@ -183,7 +183,7 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
                     "plan.sizes must name a kernel, 0 to 3, and at least one patch, one alone for "
                     "kernel 0, got kernel ",
                     plan.kernel, " and ", plan.patches, " patches; compile the scene again");
-  constexpr int stream = 3;  // of DeviceKernel, which this file does not see
+  constexpr int stream = 3;  // as in DeviceKernel, which this file does not include
   TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || plan.kernel == stream,
                     "plan must be one for kernel 3 (stream) where it has a multilevel "
                     "preconditioner, which no other knows, got kernel ",
@@ -194,8 +194,8 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   TORCH_CHECK_VALUE(plan.blocks <= most_blocks, "plan.sizes must count up to ", most_blocks,
                     " blocks of 32 pairs of tetrahedra, whose corners 32 bits count, got ",
                     plan.blocks, "; compile the scene again, with fewer patches");
-  // every slot that does not hold an interior vertex of its patch holds a shared one, but of a cluster, where all are inside
-  // one patch; pieces and pins may be absent
+  // every slot without an interior vertex of its patch holds a shared one; in a cluster all are inside one patch.
+  // Components and pins may be absent.
   const bool pieces = plan.pieces > 0, cluster = plan.kernel == 1;
   DevicePlanRows count{};
   count.size = size_count;
@@ -267,7 +267,7 @@ constexpr int material_arrays = 0
     ;
 #undef X
 
-// Where an array stands in a material.
+// The place of an array in a material.
 constexpr std::size_t place_in_material(std::string_view name) {
   constexpr std::string_view names[] = {
 #define X(name, width, rows, meaning) #name,

@@ -1,4 +1,4 @@
-// A step that was taken, as the ops of its adjoint are given it.
+// A solved step, as the ops of its adjoint receive it.
 #pragma once
 #include "binding/ops.h"
 #include "binding/plan_views.h"
@@ -8,14 +8,14 @@
 
 namespace pd {
 
-// A step that was taken, and what a loss wants of its outcome.
+// A solved step, and the loss gradients of its outcome.
 struct AdjointTensors {
   Tensor grad_positions, grad_velocities, after, positions, velocities;
   OptionalTensor forces;
   at::TensorList material, plan;
 };
 
-// What a call asks of a step that was taken, and the tensors that it points into.
+// A call's view of a solved step, and the tensors that it points into.
 template <class Backend, class T>
 class StepTaken {
  public:

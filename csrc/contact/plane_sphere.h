@@ -1,12 +1,12 @@
-// Contact with planes and balls: one vertex, projected after every iteration, with Coulomb friction.
+// Contact of a vertex with planes and spheres by projection after every iteration, with Coulomb friction.
 //
-// The diagonal D is one number a vertex, so Euclidean projection is projection in the metric of the iteration. `depth` is
-// how far the free iterate went in; at the fixed point it is theta omega g_n / D, so that moving the vertex back against its
-// slip by at most friction * depth is Coulomb's law |g_t| <= friction g_n. Friction has no energy: the guard's
-// descent argument covers the normal part alone, and the guard looks less closely where there is friction.
+// The diagonal D is one number a vertex, so Euclidean projection is projection in the metric of the iteration.
+// `depth` is the penetration of the free iterate; at the fixed point it is theta omega g_n / D. Moving the vertex
+// back against its slip by at most friction * depth is then Coulomb's law |g_t| <= friction g_n. Friction has no
+// energy: the guard's descent argument covers the normal part alone, and its slack is larger where there is friction.
 //
-// A ball acts as its tangent plane at the iterate that the step leaves from (`around`): the normal of the free iterate would
-// make the fixed point depend on relaxation and acceleration.
+// A sphere acts as its tangent plane at the iterate that the step leaves from (`around`). The normal at the free
+// iterate would make the fixed point depend on relaxation and acceleration.
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
@@ -15,7 +15,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// A vertex lies on a contact when it is no further off than this share of a way.
+// A vertex lies on a contact when its gap is at most this share of the displacement.
 constexpr double lies_within = 0.01;
 
 template <class R>
@@ -41,14 +41,14 @@ PD_HD R gap(const Ball<R>& ball, const Vec3<R>& x) {
   return square_root(dot(d, d)) - ball.radius;
 }
 
-// How far inside; what is no number stays so, and shows.
+// Penetration depth; a NaN stays NaN, so that it shows.
 template <class R>
 PD_HD R penetration(const R& distance) {
   const R none(0);
   return select(distance < none, -distance, select(distance > none, none, distance));
 }
 
-// Away from the ball; upwards for a vertex at its very centre.
+// Outward unit normal of a sphere; the y axis for a vertex at its very centre.
 template <class R>
 PD_HD Vec3<R> outward(const Ball<R>& ball, const Vec3<R>& x) {
   const Vec3<R> d = x - ball.center;
@@ -63,8 +63,8 @@ PD_HD Vec3<R> tangential(const Vec3<R>& slip, const Vec3<R>& normal) {
   return subtract_product(slip, dot(normal, slip), normal);
 }
 
-// Pushes the displacement `u` out by `depth` along `normal`, then takes back slip against the surface. Most vertices touch nothing,
-// and what is smooth takes nothing back: lane by lane the same, whether others do or not.
+// Moves the displacement `u` out by `depth` along `normal`, then takes back slip against the surface. Both early
+// returns leave every lane the bits that it would have without them.
 template <class R>
 PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, const R& friction,
                        const Vec3<R>& motion) {
@@ -81,8 +81,8 @@ PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, 
   return select(rubs, subtract_product(pushed, grip, slip), pushed);
 }
 
-// How far from a ball a vertex is after `way`; not more than 0 where it lies on it and goes along it, lifted by less than friction * slip:
-// then a force within the cone of friction could be what keeps it from that way.
+// Gap to a sphere after a `displacement`. It is at most 0 where the vertex lies on the sphere and its lift-off is
+// below friction * slip. A force within the friction cone could then prevent that displacement.
 template <class R>
 PD_HD R left_by(const Ball<R>& ball, const R& friction, const Vec3<R>& x, const Vec3<R>& way) {
   using T = scalar_of<R>;
@@ -97,12 +97,13 @@ PD_HD R left_by(const Ball<R>& ball, const R& friction, const Vec3<R>& x, const 
   return select(lies, lesser(after, lift), after);
 }
 
-// Of a normal, squared: what earlier ones leave of one that they span but for a thousandth.
+// Squared part of a unit normal that earlier normals do not span; below it the normal counts as dependent.
 constexpr double spanned = 1e-6;
-// Of a slip: where friction takes back more than that, it resists turning the slip more than the body does.
+// Where friction takes back more than this share of a slip, it resists the rotation of the slip more than the body
+// does.
 constexpr double stiff_grip = 0.1;
 
-// A projector without the part `off` that it leaves of a normal, by the reciprocal of that part's square.
+// Removes `off`, the projected part of a normal, from a projector; `reciprocal` is 1 / |off|^2.
 template <class R>
 PD_HD Mat3<R> take_off(const Mat3<R>& free, const Vec3<R>& off, const R& reciprocal) {
   return {{subtract_product(free.row[0], reciprocal * off.x, off),
@@ -110,14 +111,14 @@ PD_HD Mat3<R> take_off(const Mat3<R>& free, const Vec3<R>& off, const R& recipro
            subtract_product(free.row[2], reciprocal * off.z, off)}};
 }
 
-// What contacts leave to a vertex.
+// The directions that contacts leave to a vertex.
 template <class R>
 struct Leeway {
-  Mat3<R> free;   // projector on the directions in which it may go
+  Mat3<R> free;   // projector on the free directions
   Vec3<R> taken;  // slip that friction takes back
 };
 
-// A contact that pushes a vertex out by `depth`, if that is more than 0.
+// A contact that moves a vertex out by `depth`, if that is more than 0.
 template <class R>
 struct Push {
   Vec3<R> normal;
@@ -127,9 +128,9 @@ struct Push {
   PD_HD Vec3<R> out(const Vec3<R>& u) const { return push_out(u, normal, depth, friction, motion); }
   PD_HD Vec3<R> slip(const Vec3<R>& u) const { return tangential(u - motion, normal); }
 
-  // Takes from `left` what the contact does that pushes a vertex out from `u`: its normal, and all directions where friction takes
-  // back all slip. Friction resists the turning of a slip as a spring of its force over the slip: where that is stiff only the
-  // direction of the slip is left.
+  // Removes the directions of this contact from `projector`: its normal, and all directions where friction takes back
+  // all slip. Friction resists the rotation of a slip like a spring of stiffness force / slip. Where that spring is
+  // stiff only the direction of the slip stays free. `u` is the free iterate.
   PD_HD void take(Leeway<R>& left, const Vec3<R>& u) const {
     const R none(0), one(1);
     const Vec3<R> way = slip(multiply_add(depth, normal, u));
@@ -152,7 +153,8 @@ struct Push {
     }
   }
 
-  // `next` where friction stops it, if it went back on the slip of a vertex that the contact pushes out from `u`.
+  // `next` without its slip, where that slip is opposite to the slip of the free iterate `u`: friction stops it
+  // there.
   PD_HD Vec3<R> stop(const Vec3<R>& next, const Vec3<R>& u) const {
     const R none(0);
     const auto stops = friction * depth > none && !(dot(slip(next), slip(u)) > none);
@@ -188,7 +190,7 @@ struct Contacts {
     return u;
   }
 
-  // What the contacts leave to a vertex that they push out from a free iterate `u`.
+  // The free directions of a vertex whose free iterate is `u`.
   PD_HD Leeway<R> leeway(const Vec3<R>& x, const Vec3<R>& u, const Vec3<R>& around) const {
     const R one(1), none(0);
     Leeway<R> left = {{{{one, none, none}, {none, one, none}, {none, none, one}}},
@@ -200,7 +202,7 @@ struct Contacts {
     return left;
   }
 
-  // `next` no further than friction lets slide what the contacts push out from a free iterate `u`, and out of them.
+  // Projects a trial `next` out of the contacts; slip ends where friction stops it. `u` is the free iterate.
   PD_HD Vec3<R> land(const Vec3<R>& x, const Vec3<R>& u, const Vec3<R>& around,
                      const Vec3<R>& next) const {
     Vec3<R> stopped = next;
@@ -223,7 +225,7 @@ struct Contacts {
 
   PD_HD bool has_several() const { return plane_count + ball_count > 1; }
 
-  // of all balls, and of the planes from the `first` on
+  // The smallest gap to all spheres, and to the planes from `first` on.
   PD_HD R least_gap(const Vec3<R>& x, int first) const {
     R least(HUGE_VAL);
     for (int i = first; i < plane_count; ++i) least = lesser(least, gap(planes[i], x));
@@ -231,7 +233,8 @@ struct Contacts {
     return least;
   }
 
-  // The same after a `way` from there. `settled`: by left_by. One ball alone holds nothing by friction that it does not push.
+  // The same after a `displacement`. `settled`: friction may hold the vertex (remaining_gap). A single sphere holds
+  // by friction only what it pushes.
   PD_HD R least_left(const Vec3<R>& x, const Vec3<R>& way, int first, bool settled) const {
     if (!settled) return least_gap(x + way, first);
     R least(HUGE_VAL);
@@ -244,7 +247,8 @@ struct Contacts {
   }
 
  private:
-  // What visit(contact, u) makes of u, contact after contact. Of one that pushes nothing out it would change the sign of a 0 at most.
+  // Applies visit(contact, u) to u for one contact after another. A contact without penetration could only change the
+  // sign of a zero.
   template <class Visit>
   PD_HD Vec3<R> each(const Vec3<R>& x, Vec3<R> u, const Vec3<R>& around, const Visit& visit) const {
     const R none(0);

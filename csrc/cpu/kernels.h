@@ -14,7 +14,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// Leaves the vector registers as code for older instructions expects them; the build keeps the compiler from doing so.
+// Clears the upper vector registers for code compiled for older instructions; the build turns the compiler's own off.
 struct CleanRegisters {
   ~CleanRegisters() {
 #if PD_VECTOR_BYTES >= 32
@@ -26,7 +26,7 @@ struct CleanRegisters {
 // Fewest environments for which lanes run over environments instead of elements.
 constexpr std::int64_t least_batch = 8;
 
-// The stepper that the call's solver needs, with the memory that it alone needs.
+// The stepper of the call's solver, with its own memory.
 template <class Lanes, bool Touching, class T>
 class Runner {
  public:
@@ -70,14 +70,14 @@ std::vector<Scratch<Lanes>> make_scratches(const Plan<T>& plan, int threads) {
   return scratches;
 }
 
-// One environment after another by the whole team, or each by one thread when its patches are too few to share.
+// One environment after another by the whole team, or each by one thread when it has too few patches to share.
 template <bool Touching, class T>
 void step_singles(const StepCall<T>& call, int threads) {
   using Lanes = Single<T>;
   if (call.batch > 1 && call.plan.patches < 2 * threads)
     return step_batches<Lanes, Touching>(call, threads);
   Workspace<Lanes> work(call);
-  // before the team starts: a member without memory would keep the others waiting
+  // allocated before the team starts: a member without memory would keep the others waiting
   auto scratches = make_scratches<Lanes>(call.plan, threads);
   Runner<Lanes, Touching, T> runner(call, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
@@ -118,7 +118,7 @@ void field_any(const FieldCall<T>& call, int threads) {
   });
 }
 
-// Environments side by side where their patches are too few to share.
+// Environments run side by side where they have too few patches to share.
 template <class T>
 void conjugate_any(const ConjugateCall<T>& call, int threads) {
   using Lanes = Single<T>;
@@ -143,7 +143,7 @@ void conjugate_any(const ConjugateCall<T>& call, int threads) {
   });
 }
 
-// M of the fields, environment by environment.
+// Applies M to the fields, environment by environment.
 template <class T>
 void precondition_any(const PreconditionCall<T>& call, int threads) {
   using Lanes = Single<T>;
@@ -211,7 +211,7 @@ void rotation_any(const RotationCall<T>& call, int threads) {
   });
 }
 
-// A loop of independent multiply-adds: the arithmetic this processor can do, to compare speeds across machines.
+// A loop of independent multiply-adds: measures this processor's arithmetic, to compare speeds across machines.
 inline void multiply_add_loop(float* seconds, std::int64_t* operations) {
   constexpr int W = native_width<float>, chains = 12, rounds = 2'000'000;
   Pack<float, W> a[chains];

@@ -1,15 +1,15 @@
-// What a step that was taken says of itself: its energy, how many elements are inverted, and the residual
+// The report of a solved step: its energy, the number of inverted elements, and the residual
 //
 //   (|r| - rounding)+ / max(|f|, |r|),   |f|^2 = sum_i |a_i (u_i - s_i)|^2 + |f_i|^2,
 //
-// r being what neither pins nor contacts balance of grad E [N], f_i the force of the elements on vertex i, and a (u - s) that of
-// inertia, weight, springs and everything else: both cancel where a step is solved. Rounding is what remains of r when they do: a
-// few roundings of every stiffness times position that went into it,
+// where r [N] is the part of grad E that neither pins nor contacts balance, f_i the elastic force on vertex i, and a
+// (u - s) that of inertia, springs and external forces. The two cancel where a step is solved; rounding is what then
+// remains of r. It is a few roundings of every product of stiffness and position:
 //
-//   rounding = 4 eps sqrt(sum_i (sum_e w V |grad N_i|^2 |x| + a_i |u_i| + [a contact pushes] D_i |n| . |x_i + u_i|)^2).
+//   rounding = 4 eps sqrt(sum_i (sum_e w V |grad N_i|^2 |x| + a_i |u_i| + [contact force] D_i |n| . |x_i + u_i|)^2).
 //
-// Without it whatever weighs little beside E x, as the weight of something stiff, or a drift without any force, would read as
-// unsolved; solved steps have been seen to keep up to half of the four.
+// Without this term a body light compared with E x, such as a stiff one under its weight, or a force-free drift,
+// would read as unsolved. Solved steps have shown up to half of the factor four.
 #pragma once
 #include "math/vec.h"
 #include "solver/vertex.h"
@@ -19,7 +19,8 @@ namespace pd::inline PD_TARGET {
 
 constexpr double report_roundings = 4;
 
-// The contacts of an environment, read from its material one after another: `Contacts` for a vertex that meets them once.
+// The contacts of an environment, read from its material one after another: `Contacts` for a single visit of a
+// vertex.
 template <class T>
 struct MaterialContacts {
   const Material<T>& material;
@@ -43,7 +44,7 @@ struct MaterialContacts {
     return u;
   }
 
-  // The largest number that a gap there is the difference of: rounding of it moves what the contact pushes.
+  // The largest number that enters a gap at this position: its rounding changes the contact force.
   PD_HD double size(const Vec3<T>& place) const {
     double most = 0;
     for (int c = 0; c < material.planes_count; ++c) {
@@ -58,7 +59,7 @@ struct MaterialContacts {
   }
 };
 
-// One vertex of one environment, by the user's number; `pin` holds it, or -1.
+// One vertex of one environment, by the user's number; `pin` is the pin that holds it, or -1.
 template <class T, class P>
 struct ReportVertex {
   const ReportCall<T, P>& call;
@@ -79,7 +80,7 @@ struct ReportVertex {
                           T(call.time_step));
   }
 
-  // s, as a step has it
+  // the target s, as a step computes it
   PD_HD Vec3<T> target(const Vec3<T>& x, T stiffness) const {
     Vec3<T> offset = {T(0), T(0), T(0)}, force = offset;
     if (pin >= 0) {
@@ -98,7 +99,7 @@ struct ReportVertex {
     return (x * x + y * y) + z * z;
   }
 
-  // Adds what the vertex has of every ReportSum.
+  // Adds the vertex's terms to every ReportSum.
   PD_HD void add_to(double (&sum)[report_sums]) const {
     const T stiffness = spring(), elastic = call.elastic.of(environment)[vertex];
     const T a = held_inertia(weight(stiffness), stiffness);
@@ -122,7 +123,7 @@ struct ReportVertex {
   }
 };
 
-// What the sums of an environment come to, into its row; NaN where material or state are no numbers, or negative.
+// Writes a row of the report from an environment's sums; NaN where material or state are NaN, infinite or negative.
 template <class T>
 PD_HD void write_report(const double (&sum)[report_sums], double* row) {
   const double rounding = report_roundings * double(epsilon<T>()) * sqrt(sum[report_rounding]);

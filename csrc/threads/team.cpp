@@ -26,7 +26,7 @@ struct Job {
   std::mutex failing{};
   std::exception_ptr failure{};
 
-  // An exception, as of memory that could not be had, must not leave a thread.
+  // An exception, such as a failed allocation, must not leave a thread.
   void run(int rank) {
     try {
       work(context, {rank, size, size > 1 ? &barrier : nullptr, &watch, rank == 0});
@@ -42,13 +42,13 @@ struct Job {
   }
 };
 
-// How often this process is the child of a fork, which has none of its parent's threads but one.
+// Number of forks up to this process. A forked child has only one of its parent's threads.
 std::atomic<int> forks{0};
 const int registered = pthread_atfork(nullptr, nullptr, [] { ++forks; });
 
-// The threads that help the one they belong to. OpenMP's stay awake for milliseconds after their work, and a team of theirs
-// waits for every member. Where other processes want the cores, the first wastes time that the next work needs, and the second
-// takes a time slice of another process at every barrier.
+// The worker threads of one calling thread. OpenMP's poll for milliseconds after their work, and a team waits for
+// every member. On a busy machine the first wastes time that the next work needs. The second takes a time slice of
+// another process at every barrier.
 class Helpers {
  public:
   Helpers() = default;
@@ -64,7 +64,7 @@ class Helpers {
 
   bool are_of_this_process() const { return forks_ == forks; }
 
-  // By the team of those that come; alone for a while after a team was slow.
+  // Runs the job by the workers that start in time; alone for a while after a slow team.
   void run(Job& job, int wanted) {
     auto now = Barrier::Clock::now();
     if (now >= again_) now = gather(job, wanted);
@@ -75,7 +75,7 @@ class Helpers {
   }
 
  private:
-  // Starts those that come in time, at most `wanted`; the time then.
+  // Wakes at most `wanted` workers; returns the time when those in time have started.
   Barrier::Clock::time_point gather(Job& job, int wanted) {
     make(wanted);
     wanted = std::min(wanted, int(threads_.size()));
@@ -170,7 +170,8 @@ class Helpers {
   std::condition_variable finished_;
 };
 
-// The helpers of the calling thread. Those of a forked parent are never deleted: their threads do not exist here.
+// The workers of the calling thread. After a fork the parent's workers are never deleted: their threads do not exist
+// here.
 class OwnHelpers {
  public:
   ~OwnHelpers() {

@@ -1,4 +1,4 @@
-// A few threads that work on one thing together.
+// Threads that work on one task together.
 #pragma once
 
 #include <atomic>
@@ -8,7 +8,7 @@
 
 namespace pd {
 
-// Whether done() becomes true while this thread looks so many times.
+// Polls done() so many times; returns whether it became true.
 template <class Done>
 bool comes_soon(int looks, Done done) {
   for (int look = 0; look < looks; ++look) {
@@ -22,36 +22,36 @@ bool comes_soon(int looks, Done done) {
   return false;
 }
 
-// Waits until done(): a few microseconds awake, since most waits are as short, then by sleep(). On a busy machine a thread
-// that stayed awake would keep the one that it waits for from running.
+// Waits until done(): a few microseconds of polling, since most waits are as short, then by sleep(). On a busy
+// machine a polling thread would keep the awaited one from running.
 template <class Done, class Sleep>
 void await(Done done, Sleep sleep) {
   if (comes_soon(500, done)) return;
   while (!done()) sleep();
 }
 
-// How long a team is waited for before its caller goes on alone: far longer than an idle core takes to wake up, and shorter
-// than other processes keep one.
+// How long the caller waits for a team before it continues alone. An idle core wakes up far sooner; another process
+// keeps a core for longer.
 constexpr std::chrono::milliseconds team_patience{1};
 
-// Whether a call is to end before its work is done, as Ctrl-C asks for. The calling thread asks, now and then.
+// Interrupts a call before its work is done, as Ctrl-C asks for. The calling thread polls now and then.
 class Watch {
  public:
-  // Throws what a call is to end with, or returns. None: no call ends early.
+  // Throws the exception that ends the call, or returns. None: no call ends early.
   using Question = void (*)();
   static void set_question(Question question);
 
-  // To be called by the calling thread after so much work [vertices]: short calls never read the clock.
+  // Called by the calling thread after so much work [vertices]: short calls never read the clock.
   void worked(std::int64_t amount) {
     amount_ += amount;
     if (amount_ < amount_between_looks) return;
     amount_ = 0;
     look();
   }
-  // Asks, if that was not done for a while.
+  // Runs the check, unless the last one is recent.
   void look();
   bool ended() const { return ended_.load(std::memory_order_relaxed); }
-  // Throws what the question threw.
+  // Throws the exception of the check.
   void conclude() const {
     if (failure_) std::rethrow_exception(failure_);
   }
@@ -65,7 +65,7 @@ class Watch {
   std::atomic<bool> ended_{false};
 };
 
-// Where the members of a team meet.
+// Barrier of a team's members.
 class Barrier {
  public:
   using Clock = std::chrono::steady_clock;
@@ -90,11 +90,11 @@ class Barrier {
     await(all_are_here, [&] { phase_.wait(phase, std::memory_order_acquire); });
     if (calls) count(before, size);
   }
-  // What the watch said when the last member came: the same for all of them until they meet again.
+  // The interrupt's state when the last member arrived: the same for all members until the next barrier.
   bool ended() const { return ended_; }
-  // Whether it was `slow` then.
+  // Whether the team was `slow` then.
   bool splits() const { return splits_; }
-  // Whether the calling thread would have got further alone: it has waited longer than the others' shares take.
+  // Whether the calling thread would have been faster alone: it has waited longer than the others' shares take.
   bool slow() const { return slow_.load(std::memory_order_relaxed); }
 
  private:
@@ -115,7 +115,7 @@ class Barrier {
   Clock::duration waited_{0};
 };
 
-// Thrown in the members that a team goes on without.
+// Thrown in members that the team continues without.
 struct Dismissed {};
 
 struct Team {
@@ -123,16 +123,16 @@ struct Team {
   mutable int size = 1;               // may become 1 in `ended`
   mutable Barrier* shared = nullptr;  // null for a team of one
   Watch* watch = nullptr;
-  bool calls = false;  // whether this is the thread that called
+  bool calls = false;  // the calling thread
 
   void barrier() const {
     if (shared) shared->wait(size, calls);
   }
-  // This member as a team of its own.
+  // This member as a team of one.
   Team alone() const { return {0, 1, nullptr, watch, calls}; }
-  // Whether to stop, after so much work [vertices]. Between two barriers all members get the same answer. Nothing is half
-  // done here, so the calling thread goes on alone if other processes keep the others from their cores. Its share grows then,
-  // but no number changes, as none depends on the size of a team.
+  // Whether to stop, after so much work [vertices]. Between two barriers all members get the same answer. No
+  // operation is half done here, so the calling thread continues alone if other processes keep the members from their
+  // cores. Its share grows then, but no number changes, as none depends on the size of a team.
   bool ended(std::int64_t work) const {
     if (calls) watch->worked(work);
     if (shared && shared->splits()) {
@@ -150,8 +150,9 @@ struct Team {
 // How many threads this process may use at most.
 int most_threads();
 
-// Calls work(context, team) in every thread of a team of at most `threads`, the calling one and those that come at once; alone
-// inside another team. Throws what a member threw, or what the watch's question did.
+// Calls work(context, team) in every thread of a team: the caller and those of at most `threads` - 1 others that
+// start in time. Inside another team the caller works alone. Throws the exception of a member or of the interrupt
+// check.
 void run_team(int threads, void (*work)(void* context, const Team& team), void* context);
 
 template <class Work>

@@ -10,7 +10,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// What the elements of a plan keep of a place: nine numbers of a rotation, nine of its answer, blocks of lanes side by side.
+// The rotation Jacobian of every element: nine numbers of the rotation and nine of the inverse, in blocks of lanes.
 template <class T>
 class Turnings {
   static constexpr int W = native_width<T>, numbers = 18;
@@ -64,12 +64,12 @@ struct FrictionVectors {
   Storage storage_;
 };
 
-// What an environment is solved in, by all of a team.
+// Memory of one environment's solve, shared by a team.
 template <class T>
 struct ConjugateMemory {
   Workspace<Single<T>> vectors;
   Turnings<T> turnings;
-  std::unique_ptr<Cycle<Single<T>>> cycle;  // of a plan with levels
+  std::unique_ptr<Cycle<Single<T>>> cycle;  // null without levels
   FrictionVectors<T> friction;
 
   explicit ConjugateMemory(const ConjugateCall<T>& call)
@@ -120,7 +120,7 @@ class ConjugatePass {
     return to_quad(from[row(i)], from[row(i) + 1], from[row(i) + 2]);
   }
 
-  // Every thread finds it for itself.
+  // Every thread computes it for itself.
   void find_unit() {
     const std::int64_t count = 3 * std::int64_t(plan_.vertices);
     const T* residual = call_.residual + environment_ * count;
@@ -160,7 +160,7 @@ class ConjugatePass {
     each_part([&](std::int64_t i, Sum& sums) {
       const Quad<T> right = residual()[i];
       direction()[i] = preconditioned_residual(i);
-      // zero, unless something is infinite or no number
+      // zero, unless a number is infinite or NaN
       const Quad<T> lost = multiply_add(T(0), w_.x[i], T(0) * right);
       sums.first = multiply_add(right, right, sums.first) + lost;
       sums.second = multiply_add(right, direction()[i], sums.second);
@@ -211,7 +211,7 @@ class ConjugatePass {
     team_.barrier();
   }
 
-  // Goes on with friction, after so many products; returns whether it has.
+  // Continues with BiCGStab where vertices slide, after so many products; returns whether it has.
   bool solve_friction(const Conjugate& numbers, int products) {
     if (!call_.friction || !adds_friction(numbers, call_.tolerance) || !some_slide()) return false;
     FrictionSolve friction(nullptr, numbers.scale);
@@ -223,7 +223,7 @@ class ConjugatePass {
     return true;
   }
 
-  // every thread looks for itself
+  // every thread checks for itself
   bool some_slide() const {
     for (std::int64_t i = 0; i < plan_.vertices; ++i) {
       if (slides(sliding(i))) return true;
@@ -282,7 +282,7 @@ class ConjugatePass {
     team_.barrier();
   }
 
-  // With the true residual of y and its correction, by its |r|^2: begins a cycle, or ends.
+  // Takes the |r|^2 of the true residual of y with its correction: begins a cycle, or ends.
   void correct(FrictionSolve& friction, double square) {
     const bool enters = friction.accept(square, call_.tolerance);
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
@@ -293,7 +293,7 @@ class ConjugatePass {
     team_.barrier();
   }
 
-  // M of a field, for the result of the cycle
+  // Applies M to a field; the result stands in the cycle.
   void precondition(const Quad<T>* field) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       cycle_->input()[i] = field[i];
@@ -307,7 +307,7 @@ class ConjugatePass {
     team_.barrier();
   }
 
-  // M of the residual, for `preconditioned_residual`; returns r . M r
+  // Applies M to the residual, for `preconditioned_residual`; returns r . M r.
   double apply_levels() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       cycle_->input()[i] = residual()[i];
@@ -333,7 +333,7 @@ class ConjugatePass {
   const T* across(std::int64_t i) const {
     return call_.sliding ? sliding(i) + 3 * slide_across : nullptr;
   }
-  // of what contacts let through; null where all is
+  // on the free directions; null where all are free
   const T* projector(std::int64_t i) const {
     return call_.projector ? call_.projector + 3 * row(i) : nullptr;
   }
@@ -351,7 +351,8 @@ class ConjugatePass {
     for (int c = 0; c < 3; ++c) to[row(i) + c] = a.q.v[c];
   }
 
-  // The vertices of every part of a sweep, whose sums are left as it leaves them: in one order however many threads there are.
+  // Visits the vertices of every part of a sweep and leaves the sums as a sweep does: in one order for any number of
+  // threads.
   template <class Visit>
   void each_part(const Visit& visit) {
     for (int part = team_.begin(w_.part_count); part < team_.end(w_.part_count); ++part) {
@@ -368,7 +369,7 @@ class ConjugatePass {
     team_.barrier();
   }
 
-  // every thread adds up the same parts in the same order, so all come to the same decisions
+  // every thread adds up the same parts in the same order, so all make the same decisions
   typename Workspace<Lanes>::Part total(int parity) const {
     typename Workspace<Lanes>::Part sum = w_.parts[parity][0];
     for (int part = 1; part < w_.part_count; ++part) {
@@ -378,7 +379,7 @@ class ConjugatePass {
     return sum;
   }
 
-  // the directions stand where a sweep looks for its second field
+  // the directions stand where a sweep reads its second field
   Quad<T>* direction() const { return w_.before; }
   Quad<T>* solution() const { return w_.velocity; }
   Quad<T>* residual() const { return w_.target; }

@@ -8,13 +8,13 @@
 
 namespace pd::inline PD_TARGET {
 
-// Threads for so many vertices.
+// Number of threads that pays off for so many vertices.
 inline int useful_threads(std::int64_t vertices, int threads) {
   constexpr std::int64_t least_share = 4096;
   return int(std::min<std::int64_t>(threads, vertices / least_share + 1));
 }
 
-// visit(vertex): all of them as if there were no pins, then those that have one.
+// visit(vertex): all vertices as if there were no pins, then the pinned ones.
 template <class T, class Visit>
 void each_adjoint_vertex(const AdjointSystemCall<T>& call, int threads, const Visit& visit) {
   const Plan<T>& plan = call.plan;

@@ -5,7 +5,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// `inertia(i)` is a of an internal vertex. The ranges do not depend on how the team shares the work.
+// Loops and reduction of the comparison over a team's threads. `inertia(i)` is a of an internal vertex. The ranges do
+// not depend on how the team shares the work.
 template <class T, class Inertia>
 struct MisfitRunner {
   const Plan<T>& plan;

@@ -9,7 +9,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: see solver/vertex.h.
+// `HasContacts`: see solver/vertex.h.
 template <class Lanes, bool Touching>
 class Stepper {
  protected:
@@ -78,7 +78,7 @@ class Stepper {
     team_.barrier();
   }
 
-  // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
+  // Exact minimum of E along the rigid motions of every component that pins and contacts leave free.
   void align() {
     const bool first = !started_;
     started_ = true;
@@ -105,7 +105,7 @@ class Stepper {
     }
   }
 
-  // What the first iterate is made of.
+  // The guess that the first iterate is made from.
   Value guess(std::int64_t i) const {
     if (set_.start() == StartKind::given) return in_.at_vertex(call_.start, i) - w_.x[i];
     return set_.start() == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
@@ -137,7 +137,7 @@ class Stepper {
     return true;
   }
 
-  // Whether the call is to end now; then nothing of this step counts.
+  // Whether the call was interrupted; then nothing of this step counts.
   bool is_ended() const { return team_.ended(std::int64_t(plan_.vertices) * width); }
 
   void finish() {
@@ -247,7 +247,7 @@ class Stepper {
     if (set_.tolerance > 0) {
       // environments that are done keep their iterate
       next = select(active_ > Real(T(0)), next, u);
-      // nothing of both where a pin holds the vertex on its target
+      // both are zero where a pin holds the vertex on its target
       const Value change = next - u, way = u - w_.target[i];
       sums.first = multiply_add(change, change, sums.first);
       sums.second = multiply_add(way, way, sums.second);
@@ -266,7 +266,7 @@ class Stepper {
     return sum;
   }
 
-  // every thread adds up the same parts in the same order, so all come to the same decisions
+  // every thread adds up the same parts in the same order, so all make the same decisions
   void conclude(int k, bool guard) {
     const bool soft = set_.tolerance > 0;
     double omega[width];  // of this iteration

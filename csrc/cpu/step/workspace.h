@@ -15,12 +15,12 @@ struct FreeAligned {
 };
 using Storage = std::unique_ptr<std::byte[], FreeAligned>;
 
-// Zeroed, because the unused fourth component of a quad is read along.
+// Zeroed, because vector loads read the unused fourth component of a quad.
 inline Storage allocate_zeroed(std::size_t bytes) {
   return Storage(new (std::align_val_t{64}) std::byte[bytes]());
 }
 
-// of a loose piece, see solver/rigid/free_motion.h
+// sums of a component with free rigid motions, see solver/rigid/free_motion.h
 template <class Wide>
 struct GroupSums {
   Wide start[StartSums::count];
@@ -49,11 +49,11 @@ struct Workspace {
   Value *x, *velocity, *force, *target, *u, *before;  // [vertices]
   Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
   Value *origin, *shared_force;                       // [slots]
-  Part* parts[2];               // iterations alternate, so that nobody overwrites what others read
-  GroupSums<Wide>* group_sums;  // [groups]
-  RigidMotion<Real>* motion;    // [groups]
-  Real (*touched)[Touch::planes];  // [groups] 1 for each of the first planes that it touches
-  Real* still;                     // [groups] 1 if it starts from where it is
+  Part* parts[2];  // iterations alternate, so that no thread overwrites sums that others read
+  GroupSums<Wide>* group_sums;     // [groups]
+  RigidMotion<Real>* motion;       // [groups]
+  Real (*touched)[Touch::planes];  // [components] 1 for each of the first planes that it touches
+  Real* still;                     // [components] 1 if it starts from its current position
   Tipping* tipping;                // [groups, environments]
   bool* goes_on;                   // [groups, environments] moves in this leg, then: in the next
   TippingSearch<Real>* search;     // [groups]
@@ -62,7 +62,7 @@ struct Workspace {
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
   int part_count;
   bool shared_weight;
-  bool some_go_on = false;  // in the next leg, of any environment
+  bool some_go_on = false;  // some environment moves in the next leg
 
   explicit Workspace(const StepCall<T>& call)
       : Workspace(call.plan, call.material, call.material.stiffness.stride == 0,

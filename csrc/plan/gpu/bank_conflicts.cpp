@@ -22,10 +22,10 @@ Candidate candidate_of(const std::vector<Pair>& pairs, std::size_t number) {
   return result;
 }
 
-// Eight lanes in the making.
+// A phase of eight lanes, being filled.
 class Phase {
  public:
-  // whether one more lane with this corner in this bank costs a pass
+  // 1 if one more lane with this corner in this bank costs a pass, else 0
   int cost(int corner, int bank) const { return longest_[corner][bank]; }
 
   void add(const Pair& pair) {
@@ -47,13 +47,13 @@ class Phase {
 constexpr std::array<std::array<std::uint8_t, 3>, 6> turns = {
     {{0, 1, 2}, {1, 2, 0}, {2, 0, 1}, {0, 2, 1}, {2, 1, 0}, {1, 0, 2}}};
 
-// One way to write a pair down: a turn of its common face, and which tetrahedron comes first.
+// One order of a pair: a permutation of its common face, and which tetrahedron comes first.
 struct Writing {
   int cost = never, turn = 0;
   bool exchanged = false;
 };
 
-// The cheapest, of those that cost less than `limit`.
+// The cheapest order, if it costs less than `limit`.
 Writing best_writing(const Phase& phase, const Candidate& candidate, int limit) {
   const auto& bank = candidate.bank;
   const int kept = phase.cost(3, bank[3]) + phase.cost(4, bank[4]);
@@ -132,7 +132,7 @@ std::int32_t EntryChoice::take(int corner, int lane, std::int32_t slot) {
   const auto entry_in = [&](int q) { return first_[slot] + entry_slice * row[q]; };
   const int most_half = *std::max_element(half.begin(), half.end());
   const int most_warp = *std::max_element(warp.begin(), warp.end());
-  // passes more, then lanes met, then the rows that are left
+  // additional passes, then conflicting lanes, then the rows that are left
   const auto cost = [&](int q) {
     const int e = entry_in(q), met_half = half[e % 16], met_warp = warp[e % 32];
     return std::array<int, 3>{(met_half == most_half) + (met_warp == most_warp),

@@ -17,13 +17,13 @@ namespace {
 
 constexpr int functions = 4;                        // 1, x, y, z
 constexpr int most_coarse_nodes = 256;              // 1024 unknowns of the dense level
-constexpr std::int32_t most_of_two_levels = 12000;  // free vertices that two levels serve
+constexpr std::int32_t most_of_two_levels = 12000;  // two levels serve up to so many free vertices
 constexpr double fine_smoothing = 1.14, middle_smoothing = 1.333;  // omega of I - omega D^-1 A
-constexpr double weakest_coupling = 0.02;  // of middle nodes, of their scaled blocks
-constexpr int turning_groups = 4;          // as many as solver/multilevel/deflation.h has
-constexpr double turning_reach = 2;     // how far groups overlap, in mean depths of their vertices
-constexpr double coarse_shift = 1e-12;  // of the diagonal: above what rounding takes from a pivot
-constexpr double dependent = 1e-8;  // what orthogonalisation leaves of a column that adds nothing
+constexpr double weakest_coupling = 0.02;  // relative to the scaled blocks of middle nodes
+constexpr int turning_groups = 4;          // as in solver/multilevel/deflation.h
+constexpr double turning_reach = 2;        // overlap of groups, in mean depths of their vertices
+constexpr double coarse_shift = 1e-12;  // relative to the diagonal: above the rounding of a pivot
+constexpr double dependent = 1e-8;      // orthogonalisation leaves less of a dependent column
 
 // Diagonal of a matrix of square blocks.
 std::vector<double> diagonal(const BlockMatrix& a) {
@@ -38,7 +38,7 @@ std::vector<double> diagonal(const BlockMatrix& a) {
   return d;
 }
 
-// Edges of a matrix: how large its blocks are beside the diagonal (Frobenius), where more than `least`.
+// Edges of a matrix: Frobenius norms of its blocks, scaled by the diagonal, where larger than `least`.
 std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>& d,
                                 const std::vector<std::array<double, 3>>& centre, double least) {
   std::vector<Coupling> found;
@@ -65,7 +65,8 @@ std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>&
   return found;
 }
 
-// Makes the four columns of q [rows, 4] orthonormal, or zero where they depend on those before; q R is what they were.
+// Orthonormalises the four columns of q [rows, 4]; a dependent column becomes zero. Returns R of the factorisation q
+// R.
 std::array<double, 16> orthonormalise(std::vector<double>& q) {
   std::array<double, 16> r{};
   const std::size_t rows = q.size() / functions;
@@ -91,10 +92,10 @@ std::array<double, 16> orthonormalise(std::vector<double>& q) {
   return r;
 }
 
-// Functions that every aggregate can represent: [rows, height, 4] in, orthonormal for each aggregate out.
+// The tentative prolongation: candidates [rows, height, 4], made orthonormal on each aggregate.
 struct Tentative {
   BlockMatrix lift;             // one block a row
-  std::vector<double> reduced;  // R [aggregates, 4, 4]: the functions of the next level
+  std::vector<double> reduced;  // R [aggregates, 4, 4]: the candidates of the next level
 };
 
 Tentative tentative(const std::vector<double>& candidates, int height, const Aggregates& groups) {
@@ -143,7 +144,8 @@ BlockMatrix smoothed(const BlockMatrix& a, const std::vector<double>& inverse, d
   return lift;
 }
 
-// 1 / (lambda_max diag A), lambda_max of diag(A)^-1 A by power iteration and 5 % more; 0 where there is no function.
+// 1 / (lambda_max diag A), with lambda_max of diag(A)^-1 A from power iteration plus 5 %; 0 where there is no
+// function.
 std::vector<double> scaled_inverse(const BlockMatrix& a, int threads) {
   const std::vector<double> d = diagonal(a);
   std::vector<double> x(d.size()), y;
@@ -173,7 +175,7 @@ std::vector<double> scaled_inverse(const BlockMatrix& a, int threads) {
   return inverse;
 }
 
-// Neighbouring numbers put together, where the graph falls into more pieces than the dense level can hold.
+// Merges aggregates of neighbouring numbers, if the graph has more components than the dense level can hold.
 Aggregates limited(Aggregates groups, std::int32_t most) {
   if (groups.count <= most) return groups;
   for (std::int32_t& g : groups.of)
@@ -182,7 +184,7 @@ Aggregates limited(Aggregates groups, std::int32_t most) {
   return groups;
 }
 
-// L^-1 of a matrix L L^T, row by row up to the diagonal; nothing in the rows of what is held.
+// L^-1 of a matrix L L^T, row by row up to the diagonal; the rows of held vertices are zero.
 std::vector<double> coarse_factor(const BlockMatrix& a, const Mask& held, int threads) {
   const int n = a.rows * a.height;
   std::vector<double> dense(std::size_t(n) * n, 0.0);
@@ -211,7 +213,7 @@ BlockMatrix galerkin(const BlockMatrix& a, const BlockMatrix& lift, const Transp
   return multiply(transposed.matrix, multiply(a, lift, threads), threads);
 }
 
-// Rest positions in internal order, and the affine functions on them, of the size of one.
+// Rest positions in internal order, and the affine functions on them, scaled to the size of one.
 struct Affine {
   std::vector<std::array<double, 3>> position;
   std::vector<double> candidates;  // [vertices, 4]
@@ -252,7 +254,7 @@ std::vector<std::array<double, 3>> mean_positions(
   return mean;
 }
 
-// How a level is lifted from the one below, and the matrix of the one below.
+// The prolongation from the level below, its transpose, and the matrix of that level.
 struct Step {
   BlockMatrix lift;
   Transposed restriction;
@@ -279,7 +281,7 @@ BlockMatrix scaled(BlockMatrix m, double factor, const std::vector<double>& scal
   return m;
 }
 
-// sum += m, of which `sum` has all blocks
+// sum += m, where `sum` has all blocks of m
 void add_to(BlockMatrix& sum, const BlockMatrix& m) {
   for (std::int32_t row = 0; row < m.rows; ++row) {
     std::int32_t to = sum.start[row];
@@ -292,7 +294,7 @@ void add_to(BlockMatrix& sum, const BlockMatrix& m) {
   }
 }
 
-// (I - S A) P, S = (keep first + second) D^-1 - second first D^-1 A D^-1 being what a level smooths by.
+// (I - S A) P with a level's smoother S = (keep first + second) D^-1 - second first D^-1 A D^-1.
 BlockMatrix folded(const BlockMatrix& a, const std::vector<double>& inverse, const BlockMatrix& p,
                    int threads) {
   constexpr double once = Smoother::keep * Smoother::first + Smoother::second;
@@ -304,7 +306,7 @@ BlockMatrix folded(const BlockMatrix& a, const std::vector<double>& inverse, con
   return lift;
 }
 
-// Lifts as a GPU has them, and their transposes.
+// Folds smoothing into the prolongation and its transpose, as a GPU needs it.
 void fold(Step& step, const BlockMatrix& a, const std::vector<double>& inverse, int threads) {
   step.lift = folded(a, inverse, step.lift, threads);
   step.restriction = transpose(step.lift);
@@ -319,7 +321,8 @@ Aggregates group_nodes(const BlockMatrix& matrix,
   return limited(aggregate(graph, Mask(matrix.rows, 0), wanted), most_coarse_nodes);
 }
 
-// Four groups of vertices that overlap: 1 inside, falling to nothing a way off, over the sum of all. [vertices, 4]
+// Partition of unity [vertices, 4] of four overlapping groups: 1 inside, falling to 0 over a distance, divided by the
+// sum.
 std::vector<double> turning_weights(const Graph& graph, const Mask& held,
                                     const Positions& position) {
   const std::int32_t vertices = graph.vertices();
@@ -327,7 +330,7 @@ std::vector<double> turning_weights(const Graph& graph, const Mask& held,
       limited(aggregate_far_apart(graph, held, position, turning_groups), turning_groups);
   std::array<std::vector<double>, turning_groups> distance;
   for (int g = 0; g < turning_groups; ++g) distance[g] = distances_to(graph, groups, g);
-  // how deep vertices lie in their group, in the mean
+  // mean depth of vertices in their group
   double depth = 0, count = 0;
   for (std::int32_t v = 0; v < vertices; ++v) {
     double least = HUGE_VAL;
@@ -361,7 +364,7 @@ void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<dou
   value = std::move(matrix.value);
 }
 
-// Of the transposed matrix: where its values stand in the other, or these values, too.
+// Stores the transposed prolongation: with the places of its values in the other, or with the `values` themselves.
 void store_nodes(Step& step, bool values, Numbers& start, Numbers& row, Numbers& from,
                  std::vector<double>& value) {
   start = std::move(step.restriction.matrix.start);

@@ -1,15 +1,16 @@
-// What a solved adjoint says of the contacts that hold a vertex: dL/dp = -l . dr/dp - lambda . dgap/dp for all that a plane or a
-// ball is made of. The system stands in solver/adjoint/friction.h; beside it are the gaps, n_k . x' - height or |x' - center| - radius,
-// whose multipliers balance what the tangential directions leave of the loss,
+// Gradients of the loss by the parameters of contacts: dL/dp = -l . dr/dp - lambda . dgap/dp for planes and spheres.
+// See solver/adjoint/friction.h for the system. The gaps are n_k . x' - height or |x' - center| - radius. Their
+// multipliers balance the part of the loss gradient off the tangential directions,
 //
 //   lambda_k = m_k . q,   q = dL/dx' + dL/dv' / h - H l,   m_k dual to the normals: m_k . n_j = 1 for k = j, else 0.
 //
-// Normals turn with a plane's own and with a ball's center. What multiplies their turning, n the normal, y, d, Q and kappa as
-// there, w the way of the vertex against the contact's, P w = s, and pi_k = m_k . r how hard they push (lambda x' of planes alone):
+// Normals rotate with a plane's own normal and with a sphere's center. The table gives the factor of that rotation,
+// with n the normal and y, d, Q and kappa as there. w is the displacement relative to the contact, P w = s, and pi_k
+// = m_k . r the normal force of contact k. The term lambda x' is that of planes alone:
 //
-//   one that holds by friction    (n . w) q - lambda x'; on a ball it ends at center + R (x + m - center) / |x + m - center|
-//   one that does not             pi y + mu^2 pi (d . l) d + kappa (n . w) Q y - lambda x'
-//   several                       pi_k l - lambda_k x', and what turns with the edge of two planes
+//   sticking by friction    (n . w) q - lambda x'; on a sphere it ends at center + R (x + m - center) / |x + m - center|
+//   sliding or smooth       pi y + mu^2 pi (d . l) d + kappa (n . w) Q y - lambda x'
+//   several contacts        pi_k l - lambda_k x', and the rotation of the edge of two planes
 #pragma once
 #include "solver/adjoint/system.h"
 
@@ -24,14 +25,14 @@ class ContactGradients {
   PD_HD void give() {
     const T weight = vertex_.inertia(vertex_.spring());
     const HeldVertex<T> held = vertex_.hold(weight, [&](const ContactAt<T>& contact) {
-      // three span all others, but for rounding
+      // three normals span all others, but for rounding
       if (count_ < 3) by_[count_++] = contact;
     });
     const Vec3<T> l = vertex_.read(call_.multiplier);
-    // where an environment is lost, l has no numbers and nothing touches
+    // a failed environment has a NaN l, and touches nothing
     clear(T(0) * ((l.x + l.y) + l.z));
     if (count_ == 0) return;
-    // what several let through of the curvature of one is in H, along all directions
+    // H keeps, in all directions, the curvature term that several contacts let through
     const T inertia = weight - (count_ > 1 ? held.curvature : T(0));
     const Vec3<T> q = subtract_product(vertex_.asked() - vertex_.read(call_.elastic), inertia, l);
     count_ == 1 ? give_one(held, l, q) : give_several(held, l, q);
@@ -58,7 +59,7 @@ class ContactGradients {
       sphere(0)[n] = none;
   }
 
-  // The columns of a contact; a ball has its center where a plane has its normal.
+  // Writes the columns of a contact; a sphere has its center where a plane has its normal.
   PD_HD void write(const ContactAt<T>& contact, const Vec3<T>& first, T offset, T friction,
                    const Vec3<T>& motion) const {
     if (!(is_plane(contact) ? call_.planes : call_.spheres)) return;
@@ -76,7 +77,7 @@ class ContactGradients {
     to[spheres_motion + 2] = motion.z;
   }
 
-  // `turning`: what multiplies the turning of its normal, tangential.
+  // `turning`: the tangential factor of the rotation of its normal.
   PD_HD void write_turning(const HeldVertex<T>& held, const ContactAt<T>& contact,
                            const Vec3<T>& turning, T lambda, T friction,
                            const Vec3<T>& motion) const {
@@ -99,7 +100,7 @@ class ContactGradients {
     }
     const Vec3<T> y = tangential(l, n), slip = tangential(w, n);
     const T slipped = square_root(dot(slip, slip));
-    // of what rests on a smooth surface rounding would tell which way it slips
+    // on a smooth surface at rest, rounding alone would decide the direction of slip
     const bool slides = by.friction > T(0) || !held.holds(slipped, push);
     const Vec3<T> d = (slipped > T(0) && slides ? T(1) / slipped : T(0)) * slip;
     const T back = dot(d, l), rub = by.friction * push;
@@ -111,12 +112,12 @@ class ContactGradients {
     write_turning(held, by, turning, lambda, -push * back, turned);
   }
 
-  // By the edge of two planes a vertex may slide against friction; everything else is smooth here, as in HeldVertex.
+  // Along the edge of two planes a vertex may slide against friction; all else is smooth here, as in HeldVertex.
   PD_HD void give_several(const HeldVertex<T>& held, const Vec3<T>& l, const Vec3<T>& q) const {
     const bool edge = count_ == 2 && held.curvature == T(0);
     const Vec3<T> c = cross(by_[0].normal, by_[1].normal);
     const T size = square_root(dot(c, c));
-    // the turning of the edge, which the slip has no other direction than
+    // the rotation of the edge, which is the only direction of the slip
     Vec3<T> turns = {T(0), T(0), T(0)}, d = turns;
     T rub(0);
     if (edge && !held.stuck) {
@@ -146,7 +147,7 @@ class ContactGradients {
   PD_HD Vec3<T> dual(int k) const {
     const Vec3<T>&a = by_[(k + 1) % count_].normal, &b = by_[(k + 2) % 3].normal;
     const Vec3<T> n = by_[k].normal;
-    // of two what is left of the one without the other
+    // for two contacts, the part of one normal orthogonal to the other
     const Vec3<T> m = count_ == 2 ? subtract_product(dot(a, a) * n, dot(a, n), a) : cross(a, b);
     return (T(1) / dot(m, n)) * m;
   }

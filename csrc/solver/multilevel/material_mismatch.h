@@ -1,4 +1,4 @@
-// How far the material of a step is from that which M of solver/multilevel/lbfgs.h was made of.
+// How far the material of a step is from the reference material of the preconditioner M (solver/multilevel/lbfgs.h).
 #pragma once
 #include "math/config.h"
 #include "views/views.h"
@@ -7,7 +7,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// Ratios of one to the other.
+// Range of the ratios of the step's values to the reference values.
 struct Range {
   double least = HUGE_VAL, largest = 0;
 
@@ -20,13 +20,13 @@ struct Range {
 };
 
 constexpr double known_inertia =
-    4;  // times what M was made of and the elements have become: more is left to the diagonal
+    4;  // times the reference and the elements' change: vertices beyond are outliers
 
 struct Misfit {
-  double scale = 1;        // s of A <= s A_0, strangers aside
-  double spread = 0;       // 1 - q / s, q A_0 <= A <= s A_0 with them
-  double trusted = 1;      // ratio of inertias up to known_inertia times which M is believed
-  bool strangers = false;  // whether there are vertices beyond, or that M alone holds
+  double scale = 1;        // s of A <= s A_0, without outliers
+  double spread = 0;       // 1 - q / s for q A_0 <= A <= s A_0, with outliers
+  double trusted = 1;      // ratio of inertias that M can represent, within outlier_ratio
+  bool strangers = false;  // some vertices are outliers, or held by M alone
 
   Misfit() = default;
 
@@ -34,7 +34,7 @@ struct Misfit {
       : trusted(larger(elements.largest, smaller(inertias.least, inertias.largest))),
         strangers(inertias.largest > known_inertia * trusted) {}
 
-  // `common`: the inertias that are no strangers'; `other_pins`: the step holds other vertices than M does
+  // `common`: ratios of all vertices but outliers; `other_pins`: the step holds other vertices than M does
   PD_HD void conclude(const Range& elements, const Range& inertias, const Range& common,
                       bool other_pins) {
     scale = larger(elements.largest, common.largest);

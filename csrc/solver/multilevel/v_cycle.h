@@ -1,9 +1,9 @@
 // M of solver/multilevel/lbfgs.h: a symmetric V-cycle, or A^-1 where the plan says so (Levels::direct).
 //
-// With S that smooths before and after, a prolongation P and B in place of the matrix below, a cycle is
+// With the smoother S before and after, the prolongation P, and B in place of the coarser matrix, a cycle is
 //   S r + S (r - A S r) + (I - S A) P B P^T (I - A S) r.
-// Its first two terms know nothing of the level below, so with F = (I - S A) P as lifts they are worked out meanwhile: what a GPU
-// does, where a cycle is as long as the phases that wait for one another (cuda/multilevel/v_cycle.h). The CPU goes down and up, with P.
+// The first two terms do not depend on the coarser level. With F = (I - S A) P as prolongation a GPU computes them
+// meanwhile: there the phases that wait for one another make the length of a cycle (cuda/multilevel/v_cycle.h). The CPU uses P.
 #pragma once
 #include "math/scalar.h"
 #include "views/views.h"
@@ -18,7 +18,7 @@ struct Smoother {
   static constexpr double first = 1 / middle, keep = 1 + next * ratio, second = 2 * next / half;
 };
 
-// A matrix level with B unknowns a row and axis, and how it is lifted from four functions of each node below.
+// A matrix level with B unknowns a row and axis, and its prolongation from four functions of each coarse node.
 template <int B, class T>
 struct Level {
   int rows, nodes;
@@ -46,7 +46,7 @@ PD_HD Level<4, T> middle_level(const Levels<T>& l) {
           l.middle_node_weight};
 }
 
-// Sums of a row in turn, because each waits for its own last addition; they are added up last.
+// Partial sums of a row, used in turn, because each addition waits for the last one of its chain.
 constexpr int row_chains = 4;
 
 template <class Value>
@@ -54,7 +54,7 @@ PD_HD Value join(const Value (&sum)[row_chains]) {
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-// A x, one row of numbers: number p of it goes to chain p mod 4. One environment and several get the same bits.
+// A x, one row: number p goes to chain p mod 4. One environment and several get the same bits.
 template <class Real, class T, class Value>
 PD_HD Value row_product(const Level<1, T>& level, const Value* x, int row) {
   const int32 end = level.start[row + 1];
@@ -70,7 +70,7 @@ PD_HD Value row_product(const Level<1, T>& level, const Value* x, int row) {
   if constexpr (several) {
     for (int c = 0; p + c < end; ++c) add(c, p + c, level.value[p + c]);
   } else if (p < end) {
-    // always four steps, because branches on what is left are mispredicted; zeros change no finite sum
+    // always four steps, because branches on the remainder are mispredicted; zeros change no finite sum
     for (int c = 0; c < row_chains; ++c) {
       const int32 at = p + c < end ? p + c : end - 1;
       add(c, at, p + c < end ? level.value[at] : T(0));
