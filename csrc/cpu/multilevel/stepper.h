@@ -1,4 +1,4 @@
-// Runner of solver/multilevel/lbfgs.h on the CPU: what Stepper does of a step, and another way to the next iterate.
+// Runner of solver/multilevel/lbfgs.h on the CPU: a Stepper with other iterations.
 #pragma once
 #include "cpu/multilevel/deflation.h"
 #include "cpu/multilevel/material_mismatch.h"
@@ -10,7 +10,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: see solver/vertex.h.
+// `HasContacts`: see solver/vertex.h.
 template <class Lanes, bool Touching>
 class MultilevelStepper : public Stepper<Lanes, Touching> {
   using Base = Stepper<Lanes, Touching>;
@@ -65,7 +65,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
 
   void descend() { multilevel_iterations(*this, set_); }
 
-  // E and what is out of balance at the trial u
+  // E and the residual at the trial u
   void evaluate(int k) {
     sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
       const auto v = vertex(i);
@@ -76,7 +76,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
         o_.fresh_free[i] = left.free;
         o_.fresh_friction[i] = v.friction(left.taken);
         o_.fresh_gradient[i] = v.gradient(w_.u[i], force);
-        // work against the friction of the base
+        // work against the friction at the iterate
         sums.first = multiply_add(o_.friction[i], w_.u[i] - o_.base[i], sums.first);
       }
     });
@@ -88,7 +88,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     for (int lane = 0; lane < width; ++lane) {
       if (done_[lane]) {
         Lanes::set_lane(accepted_, lane, T(0));
-        // what moves on in its lane has no part in sums either
+        // a finished lane must not enter sums either
         Lanes::set_lane(finite_, lane, T(0));
         continue;
       }
@@ -100,7 +100,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  // The pair from the base to the trial, kept or not: it holds for the curvature on the way. Then the base moves on.
+  // The secant pair from the iterate to the trial, accepted or not: it holds the curvature in between. Then the
+  // iterate moves.
   void learn(int k) {
     newest_ = (newest_ + 1) % history;
     iteration_ = k;
@@ -110,7 +111,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
         o_.pull[i] = o_.fresh[i];
       }
       const Value change = w_.u[i] - o_.base[i];
-      // directions are those of another step at first
+      // at first the directions are those of another step
       const Value s = k == 0 ? none_ : restricted(i, change);
       const Value y = k == 0 ? none_ : restricted(i, o_.fresh[i] - o_.pull[i]);
       if constexpr (Touching) {
@@ -120,7 +121,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
         }
         keep_directions(i);
       }
-      // what momentum goes on along
+      // the previous iterate, for momentum
       w_.before[i] = choose(o_.base[i], w_.before[i]);
       o_.base[i] = choose(w_.u[i], o_.base[i]);
       o_.pull[i] = choose(o_.fresh[i], o_.pull[i]);
@@ -130,7 +131,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
         sum[2 * history + 1] = multiply_add(way, way, sum[2 * history + 1]);
       }
       if (!lbfgs_) return;
-      // what is no number must not poison sums in which it has no part, those of the next environment among them
+      // a NaN must not poison sums that it has no part in, such as those of the next environment
       o_.s[newest_][i] = pick(finite_, numbers(s), none_);
       o_.y[newest_][i] = pick(finite_, numbers(y), none_);
       const Value g = restricted(i, o_.pull[i]);
@@ -160,7 +161,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     team_.barrier();
   }
 
-  // whether no lane asks for M
+  // whether no lane needs M
   bool goes_by_diagonal() const {
     const auto without = [&](int lane) { return done_[lane] || outer_[lane].diagonal; };
     for (int lane = 0; lane < width; ++lane)
@@ -168,7 +169,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     return lbfgs_;
   }
 
-  // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
+  // direction = theta M g, corrected by secant pairs; the diagonal serves blocked directions and outliers
   void precondition() {
     if (corotates_) corotate(iteration_);
     Real alpha[history] = {}, scale;
@@ -194,7 +195,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     each_vertex([&](std::int64_t i) { o_.direction[i] = o_.cycle.result()[i]; });
   }
 
-  // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
+  // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi
+  // iteration
   void advance() {
     Real beta, length, fallback, diagonal;
     bool some_fallback = false;
@@ -226,7 +228,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     });
   }
 
-  // the last trial counts only if it is better than the base, and that only if its energy is a number
+  // the result is the last trial if accepted, else the iterate; NaN if even its energy is NaN
   void settle() {
     Real lost;
     for (int lane = 0; lane < width; ++lane)
@@ -237,13 +239,13 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   }
 
  private:
-  // whether contacts are in the small problem
+  // whether the coarse problem includes contacts
   bool is_held(int lane) const {
     if constexpr (!Touching) return false;
     return made_[lane] > 0 && corotation_.is_held(lane);
   }
 
-  // The lanes whose small problem is made at iteration k, of where they stand.
+  // Builds the coarse problem of the lanes that need it at iteration k, at their iterates.
   void corotate(int k) {
     bool asks[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
@@ -251,7 +253,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       const TurningPlan plan(k, made_[lane], outer.restarts - doubted_[lane], Touching,
                              outer.turns());
       asks[lane] = false;
-      // alone it would not have come here
+      // alone this lane would not be here
       if (outer.diagonal) continue;
       asks[lane] = !done_[lane] && plan.make;
       some = some || asks[lane];
@@ -277,7 +279,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  // the cycle, and what the small problem gives, around it where something holds vertices that M has free
+  // the cycle with the coarse problem, which encloses it where contacts or outliers hold vertices that M leaves free
   void run_corotated(const Real& scale) {
     Value *in = o_.cycle.input(), *z = o_.cycle.result();
     bool around[width], some = false;
@@ -292,10 +294,10 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     each_vertex([&](std::int64_t i) { z[i] = corotation_.with(i, z[i]); });
   }
 
-  // where the lane accepted its trial `a`, else `b`
+  // `a` where the lane accepted its trial, else `b`
   Value choose(const Value& a, const Value& b) const { return pick(accepted_, a, b); }
 
-  // 0 for what is infinite or NaN
+  // 0 for infinity and NaN
   static Value numbers(const Value& a) {
     const auto number = [](const Real& x) {
       return select(lesser(x, -x) > Real(T(-HUGE_VAL)), x, Real(T(0)));
@@ -334,7 +336,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  // from the base
+  // from the iterate
   TrialVertex<Lanes, Touching> trial_vertex(const Vertex<Lanes, Touching>& v,
                                             std::int64_t i) const {
     return {v, o_.base[i], o_.pull[i], o_.free + i, plan_.levels, i, outliers_};
@@ -377,13 +379,13 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     });
   }
 
-  // The soft stop of an environment, by a trial that it went on from, or went back from: at rest rounding decides which.
+  // The stopping test of an environment. A rejected trial counts too: at rest rounding decides which trials are.
   void stop(int lane, int k, double change, double way) {
     if (!(set_.tolerance > 0) || k == 0 || done_[lane]) return;
     done_[lane] = outer_[lane].ends(set_.tolerance, schedule_[lane], change, way);
   }
 
-  // how far the material is from that of M, per lane
+  // the material mismatch of each lane
   void compare_with_reference() {
     for (int lane = 0; lane < width; ++lane) {
       const auto inertia = [&](std::int64_t i) {
@@ -402,8 +404,8 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   Outliers<Real> outliers_{false, Real(T(1))};  // in any lane
   int newest_ = 0, iteration_ = 0;
   bool has_[width] = {};                        // a small problem
-  bool holds_[width] = {};                      // and in it what contacts hold at the base
-  int made_[width] = {}, doubted_[width] = {};  // times, and failed trials by then
+  bool holds_[width] = {};                      // includes the contacts at the iterate
+  int made_[width] = {}, doubted_[width] = {};  // coarse problems built, and failed trials by then
   Corotation<Lanes> corotation_;
   Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});
   Real accepted_{T(1)}, finite_{T(1)};

@@ -1,4 +1,4 @@
-// Memory of the multilevel solver's outer iteration.
+// Memory of the multilevel solver's iterations.
 #pragma once
 #include "cpu/multilevel/deflation_workspace.h"
 #include "cpu/multilevel/v_cycle.h"
@@ -6,26 +6,27 @@
 
 namespace pd::inline PD_TARGET {
 
-// Vectors of the outer iteration, beside those of a Workspace, in which u is the trial.
+// Vectors of the multilevel iterations, beside those of a Workspace, whose u is the trial.
 template <class Lanes>
 struct OuterWork {
   using Real = typename Lanes::Real;
   using Value = typename Lanes::Value;
   using Wide = typename Lanes::Wide;
 
-  static constexpr int dots = 2 * history + 4;  // sums that one pass may make
-  static constexpr int chunk = 256;             // vertices that one of them covers
+  static constexpr int dots = 2 * history + 4;  // sums of one pass
+  static constexpr int chunk = 256;             // vertices in one partial sum
 
   Cycle<Lanes> cycle;
   CorotationWork<Lanes> corotation;
   Value *base, *pull, *fresh,
-      *direction;  // [vertices] iterate to go on from, residuals there and at the trial
+      *direction;  // [vertices] iterate, residual there, residual at the trial, direction
   Value *s[history], *y[history];  // [vertices] L-BFGS pairs
-  Mat3<Real>*free, *fresh_free;  // [vertices] directions that contacts leave; none without contacts
-  // [vertices] dE/du with what contacts balance, and their friction; none without contacts
+  Mat3<Real>*free,
+      *fresh_free;  // [vertices] projectors on the free directions; null without contacts
+  // [vertices] dE/du without the contacts' reaction, and friction; null without contacts
   Value *gradient, *fresh_gradient, *friction, *fresh_friction;
   Wide (*sums)[dots];             // [chunks]
-  Range (*ranges)[ranges_count];  // [threads] of the material to that of M
+  Range (*ranges)[ranges_count];  // [threads] ratios of the material to that of M
   int chunks;
 
   OuterWork(const StepCall<typename Lanes::Scalar>& call, bool touching, int threads)

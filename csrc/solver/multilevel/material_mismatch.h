@@ -47,10 +47,10 @@ struct Misfit {
   PD_HD static double smaller(double a, double b) { return b < a ? b : a; }
 };
 
-constexpr int ranges_count = 2;  // that threads compare at a time
+constexpr int ranges_count = 2;  // ranges that threads reduce at a time
 
-// Measures together with all threads of a team. The runner supplies each_tet(visit(t)) and each_vertex(visit(i, a)) over the
-// thread's share, a being 0 where the step holds the vertex, and meet(ranges), which makes them those of all threads.
+// Measures with all threads of a team. The runner supplies each_tet(visit(t)) and each_vertex(visit(i, a)) over the
+// thread's share, with a = 0 where the step holds the vertex. Its reduce(ranges) combines the ranges of all threads.
 #if defined(__CUDACC__)
 #pragma nv_exec_check_disable
 #endif
@@ -61,7 +61,7 @@ PD_HD Misfit measure_misfit(Runner& run, const Levels<T>& levels, const T* stiff
   run.each_tet([&](std::int64_t t) {
     elements.count(double(stiffness[t]) / double(levels.reference_stiffness[t]));
   });
-  // visit(a / a_0) of the vertices that neither the step nor M holds; counts those that one of them alone holds
+  // visit(a / a_0) for vertices that neither the step nor M holds; counts those that only one of them holds
   const auto each_inertia = [&](const auto& visit) {
     run.each_vertex([&](std::int64_t i, double a) {
       const bool free = levels.fine_inverse[i] > T(0);
