@@ -297,7 +297,7 @@ PYBIND11_MODULE(_C, m) {
       "torchpd::*.";
   main_thread =
       py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
-  pd::Watch::set_question(&run_signal_handlers);
+  pd::Interrupt::set_check(&run_signal_handlers);
   m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("patch_size"),
         py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
@@ -325,7 +325,7 @@ PYBIND11_MODULE(_C, m) {
   m.attr("info_numbers") = int(pd::info_count);
   m.attr("slide_vectors") = int(pd::slide_count);
   m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("many"),
-        py::arg("slots"), py::arg("entries"), py::arg("planes"), py::arg("balls"),
+        py::arg("slots"), py::arg("entries"), py::arg("planes"), py::arg("spheres"),
         "Shared memory of a block of the kernels block and (many patches) grid.");
   m.def(
       "fits_cluster",
@@ -337,7 +337,7 @@ PYBIND11_MODULE(_C, m) {
   m.def("cluster_threads", &pd::cluster_threads, py::arg("real"), py::arg("pairs"),
         py::arg("interior"), "Threads of a block of the kernel cluster.");
   m.def("cluster_shared_bytes", &pd::cluster_shared_bytes, py::arg("real"), py::arg("slots"),
-        py::arg("entries"), py::arg("interior"), py::arg("planes"), py::arg("balls"),
+        py::arg("entries"), py::arg("interior"), py::arg("planes"), py::arg("spheres"),
         "Shared memory of a block of the kernel cluster.");
   m.attr("most_cluster_blocks") = pd::most_cluster_blocks;
   m.def(
@@ -363,7 +363,7 @@ PYBIND11_MODULE(_C, m) {
       "preconditioner.");
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("corotation_bytes") = pd::corotation_bytes;
-  m.attr("known_inertia") = pd::known_inertia;
+  m.attr("outlier_ratio") = pd::outlier_ratio;
   m.attr("adjoint_tolerance") =
       std::make_pair(pd::adjoint_tolerance<float>, pd::adjoint_tolerance<double>);
   m.attr("adjoint_failed") = pd::adjoint_failed;

@@ -47,9 +47,10 @@ constexpr int level_arrays = 0
 
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
-  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_lift, host_fine_lift,
-      device_fine_lift, fine_node_end, middle_end, middle_entry, middle, middle_lift,
-      host_middle_lift, device_middle_lift, middle_node_end, coarse_entry, device_coarse_entry;
+  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_prolongation,
+      host_fine_prolongation, device_fine_prolongation, fine_node_end, middle_end, middle_entry,
+      middle, middle_prolongation, host_middle_prolongation, device_middle_prolongation,
+      middle_node_end, coarse_entry, device_coarse_entry;
 };
 
 // The preconditioner's arrays, which begin at `first`.
@@ -68,17 +69,19 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   count.vertex = vertices;
   count.fine_end = vertices + 1;
   count.fine_entry = size[level_fine_entries];
-  count.fine_lift = size[level_fine_lifts];
+  count.fine_prolongation = size[level_fine_prolongations];
   count.fine_node_end = levels.fine_nodes + 1;
   count.middle_end = middle ? levels.fine_nodes + 1 : 0;
   count.middle_entry = size[level_middle_entries];
   count.middle = middle ? levels.fine_nodes : 0;
-  count.middle_lift = size[level_middle_lifts];
+  count.middle_prolongation = size[level_middle_prolongations];
   count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
   count.coarse_entry = coarse * (coarse + 1) / 2;
   const bool on_device = place.device.is_cuda();
-  (on_device ? count.device_fine_lift : count.host_fine_lift) = count.fine_lift;
-  (on_device ? count.device_middle_lift : count.host_middle_lift) = count.middle_lift;
+  (on_device ? count.device_fine_prolongation : count.host_fine_prolongation) =
+      count.fine_prolongation;
+  (on_device ? count.device_middle_prolongation : count.host_middle_prolongation) =
+      count.middle_prolongation;
   count.device_coarse_entry = on_device ? count.coarse_entry : 0;
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = first;

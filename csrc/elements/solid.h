@@ -114,10 +114,10 @@ PD_HD void solid_hessian_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
 
 // The same for many directions at one position, which `jacobian` holds.
 template <class R, class Rest>
-PD_HD void solid_hessian_product(const Turning<R>& turning, const Vec3<R> (&dx)[4],
+PD_HD void solid_hessian_product(const RotationJacobian<R>& jacobian, const Vec3<R> (&dx)[4],
                                  const Rest& rest_inverse, const R& weight, Vec3<R> (&g)[4]) {
   const Mat3<R> df = deformation_gradient(dx, rest_inverse);
-  corner_forces(weight * (df - turning.differential(df)), rest_inverse, g);
+  corner_forces(weight * (df - jacobian.differential(df)), rest_inverse, g);
 }
 
 // Derivative of the energy along `dx`: w V (F - R) : dF

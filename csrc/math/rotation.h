@@ -144,7 +144,7 @@ PD_HD Mat3<R> nearest_rotation(const Mat3<R>& f) {
 
 // tr(S) I - S for the symmetric part of S: the second derivative of tr(R^T F) under a small rotation of R.
 template <class R>
-PD_HD Mat3<R> turn_matrix(const Mat3<R>& s) {
+PD_HD Mat3<R> axis_matrix(const Mat3<R>& s) {
   const R trace = s.row[0].x + s.row[1].y + s.row[2].z;
   const R minus_half(scalar_of<R>(-0.5));
   const R xy = minus_half * (s.row[0].y + s.row[1].x);
@@ -156,8 +156,8 @@ PD_HD Mat3<R> turn_matrix(const Mat3<R>& s) {
 
 // Solves (tr(S) I - S) x = axis for the rotation vector x.
 template <class R>
-PD_HD Vec3<R> solve_turn(const Mat3<R>& s, const Vec3<R>& axis) {
-  const Mat3<R> h = turn_matrix(s), c = cofactor(h);
+PD_HD Vec3<R> solve_axis(const Mat3<R>& s, const Vec3<R>& axis) {
+  const Mat3<R> h = axis_matrix(s), c = cofactor(h);
   return (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * (c * axis);
 }
 
@@ -179,23 +179,23 @@ PD_HD Mat3<R> cross_matrix(const Vec3<R>& a) {
 template <class R>
 PD_HD Mat3<R> rotation_differential(const Mat3<R>& f, const Mat3<R>& r, const Mat3<R>& df) {
   const Mat3<R> rt = transpose(r);
-  return r * cross_matrix(solve_turn(rt * f, axis_of(rt * df)));
+  return r * cross_matrix(solve_axis(rt * f, axis_of(rt * df)));
 }
 
 // The part of this derivative that depends on F alone, for many directions: R, and the inverse of tr(S) I - S.
 template <class R>
-struct Turning {
-  Mat3<R> rotation, answer;
+struct RotationJacobian {
+  Mat3<R> rotation, inverse;
 
-  Turning() = default;
+  RotationJacobian() = default;
 
-  PD_HD explicit Turning(const Mat3<R>& f) : rotation(nearest_rotation(f)) {
-    const Mat3<R> h = turn_matrix(transpose(rotation) * f), c = cofactor(h);
-    answer = (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * c;
+  PD_HD explicit RotationJacobian(const Mat3<R>& f) : rotation(nearest_rotation(f)) {
+    const Mat3<R> h = axis_matrix(transpose(rotation) * f), c = cofactor(h);
+    inverse = (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * c;
   }
 
   PD_HD Mat3<R> differential(const Mat3<R>& df) const {
-    return rotation * cross_matrix(answer * axis_of(transpose(rotation) * df));
+    return rotation * cross_matrix(inverse * axis_of(transpose(rotation) * df));
   }
 };
 
@@ -207,7 +207,7 @@ PD_HD Mat3<R> polished_rotation(const Mat3<R>& f) {
   const auto good = trusted(i, largest_root(i));
   const Mat3<R> r = nearest_rotation(f);
   const Mat3<R> s = transpose(r) * f;
-  const Mat3<R> turn = cross_matrix(solve_turn(s, axis_of(s)));
+  const Mat3<R> turn = cross_matrix(solve_axis(s, axis_of(s)));
   Mat3<R> turned = r * turn;
   for (int a = 0; a < 3; ++a) turned.row[a] = turned.row[a] + r.row[a];
   const Mat3<R> metric = transpose(turned) * turned;

@@ -27,7 +27,7 @@ constexpr double largest_rho = 0.99999;
 
 // What the change of one iteration says about the error. `changed` is a lower bound of change over error; `kept` is
 // the share of the error seen in an earlier change that may remain.
-struct Share {
+struct ErrorShare {
   double changed = 1, kept = 0;
 };
 
@@ -68,7 +68,7 @@ struct Schedule {
   }
 
   // Error share of an iteration with weight omega, for the slowest mode.
-  PD_HD Share share_of(double omega) const {
+  PD_HD ErrorShare error_share(double omega) const {
     const double sum = omega * slowest, discriminant = sum * sum - 4 * (omega - 1);
     // at the limit the discriminant is zero but for rounding, also that of a float's omega
     const bool real = discriminant > 1e-6;
@@ -81,7 +81,7 @@ struct Schedule {
     return rho > 0 ? rho : 0;
   }
 
-  PD_HD bool wants_energy(int k) const {
+  PD_HD bool checks_energy(int k) const {
     return kind == ScheduleKind::guarded && k % guard_period == 0;
   }
 

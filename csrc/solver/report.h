@@ -35,11 +35,11 @@ struct MaterialContacts {
     for (int c = 0; c < material.spheres_count; ++c) {
       const T* p = material.spheres.of(environment) + spheres_numbers * c;
       const T* motion = p + spheres_motion;
-      const Ball<T> ball = {{p[0], p[1], p[2]},
-                            {motion[0], motion[1], motion[2]},
-                            p[spheres_radius],
-                            p[spheres_friction]};
-      u = pd::project(ball, x, u, around);
+      const Sphere<T> sphere = {{p[0], p[1], p[2]},
+                                {motion[0], motion[1], motion[2]},
+                                p[spheres_radius],
+                                p[spheres_friction]};
+      u = pd::project(sphere, x, u, around);
     }
     return u;
   }
@@ -109,13 +109,13 @@ struct ReportVertex {
     const Vec3<T> none = {T(0), T(0), T(0)}, twice = at.add_energy(u, none);
     sum[report_energy] += double(shares.x) + 0.5 * double((twice.x + twice.y) + twice.z);
     sum[report_inverted] += double(shares.z);
-    sum[report_wrong] += share_of_inertia(a, elastic, at.inverse) < T(0) ? 1 : 0;
+    sum[report_wrong] += inertia_ratio(a, elastic, at.inverse) < T(0) ? 1 : 0;
     if (!(at.inverse > T(0))) return;
     const MaterialContacts<T> contacts{call.material, environment};
     const Vec3<T> slope = at.gradient(u, force), free = subtract_product(u, at.inverse, slope);
     const Vec3<T> pushed = contacts.project(x, free, u) - free;
     const bool touches = !(dot(pushed, pushed) == T(0));
-    sum[report_unbalanced] += square(touches ? at.unbalanced(contacts, u, force) : slope);
+    sum[report_residual] += square(touches ? at.residual(contacts, u, force) : slope);
     sum[report_force] += square(a * (u - at.target)) + square(force);
     double rounding = double(shares.y) + double(a) * sqrt(square(u));
     if (touches) rounding += contacts.size(x + u) / double(at.inverse);
@@ -127,11 +127,11 @@ struct ReportVertex {
 template <class T>
 PD_HD void write_report(const double (&sum)[report_sums], double* row) {
   const double rounding = report_roundings * double(epsilon<T>()) * sqrt(sum[report_rounding]);
-  const double left = sqrt(sum[report_unbalanced]), force = sqrt(sum[report_force]);
-  const double whole = left > force ? left : force;
+  const double residual = sqrt(sum[report_residual]), force = sqrt(sum[report_force]);
+  const double whole = residual > force ? residual : force;
   const bool known = sum[report_wrong] == 0 && absolute(sum[report_energy]) < HUGE_VAL &&
-                     left < HUGE_VAL && force < HUGE_VAL && rounding < HUGE_VAL;
-  row[info_residual] = !known ? NAN : left > rounding ? (left - rounding) / whole : 0;
+                     residual < HUGE_VAL && force < HUGE_VAL && rounding < HUGE_VAL;
+  row[info_residual] = !known ? NAN : residual > rounding ? (residual - rounding) / whole : 0;
   row[info_energy] = sum[report_energy];
   row[info_inverted] = sum[report_inverted];
   if (!known) row[info_converged] = 0;

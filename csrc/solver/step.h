@@ -20,28 +20,27 @@ namespace pd::inline PD_TARGET {
 
 // The stopping test of an environment: whether the estimated error is within the tolerance, relative to |u - s|. That
 // is the displacement which elasticity and contacts cause; a common motion of all vertices does not change it.
-struct SoftStop {
-  double fall =
+struct StoppingTest {
+  double free_fall =
       0;  // squared_free_fall: lower bound of |u - s|^2, so that free fall does not compare roundings
-  double left = 0;  // estimated error
+  double error = 0;  // estimated error
 
   // Takes the squares of the last change and of |u - s|; an overflow goes on. With share.changed = 0 a change says
   // nothing.
-  PD_HD bool ends(double tolerance, const Share& share, double change, double way) {
+  PD_HD bool is_met(double tolerance, const ErrorShare& share, double change, double displacement) {
     if (!(share.changed > 0)) return false;
-    const double shown = sqrt(change) / share.changed, before = share.kept * left;
-    left = shown < before ? before : shown;
-    way = way < fall ? fall : way;
-    return tolerance > 0 && way < HUGE_VAL && left <= tolerance * sqrt(way);
+    const double from_change = sqrt(change) / share.changed, remaining = share.kept * error;
+    error = from_change < remaining ? remaining : from_change;
+    displacement = displacement < free_fall ? free_fall : displacement;
+    return tolerance > 0 && displacement < HUGE_VAL && error <= tolerance * sqrt(displacement);
   }
 };
 
 // Square of the displacement by gravity in one step, summed over so many vertices.
 template <class R>
-PD_HD double square_of_fall(int vertices, double time_step, const Vec3<R>& gravity) {
-  const double way = time_step * time_step;
-  const double x = way * double(gravity.x), y = way * double(gravity.y),
-               z = way * double(gravity.z);
+PD_HD double squared_free_fall(int vertices, double time_step, const Vec3<R>& gravity) {
+  const double h2 = time_step * time_step;
+  const double x = h2 * double(gravity.x), y = h2 * double(gravity.y), z = h2 * double(gravity.z);
   return vertices * (x * x + y * y + z * z);
 }
 

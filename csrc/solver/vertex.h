@@ -38,7 +38,7 @@ PD_HD R inverse_diagonal(const R& inertia, const R& elastic) {
 
 // a / D of a vertex that moves; infinite where a pin holds it, -1 where mass, spring or stiffness are negative
 template <class R>
-PD_HD R share_of_inertia(const R& inertia, const R& elastic, const R& inverse) {
+PD_HD R inertia_ratio(const R& inertia, const R& elastic, const R& inverse) {
   const R none(0), wrong(-1), held(HUGE_VAL);
   const R share = select(inertia > none, inertia * inverse, held);
   return select(inertia < none, wrong, select(elastic < none, wrong, share));
@@ -64,7 +64,7 @@ struct Thread {
 // One vertex during a step, in each environment that Lanes runs side by side. Real is one number of each environment
 // and Value one vector; vec3() and value() convert between Value and Vec3<Real>. Displacements u start at x.
 // `HasContacts`: the scene has contacts. Without it no contact code is compiled.
-template <class Lanes, bool Touching>
+template <class Lanes, bool HasContacts>
 struct Vertex {
   using T = typename Lanes::Scalar;
   using Real = typename Lanes::Real;
@@ -81,27 +81,28 @@ struct Vertex {
   // `u` projected out of the contacts; `around`: see contact/plane_sphere.h
   template <class Obstacles>
   PD_HD Value project(const Obstacles& contacts, const Value& u, const Value& around) const {
-    if constexpr (!Touching) return u;
+    if constexpr (!HasContacts) return u;
     return hold(
         u, Lanes::value(contacts.project(Lanes::vec3(x), Lanes::vec3(u), Lanes::vec3(around))));
   }
 
   // the first iterate, from a guess
-  PD_HD Value first(const Contacts<Real>& contacts, const Value& guess) const {
+  PD_HD Value first_iterate(const Contacts<Real>& contacts, const Value& guess) const {
     // a NaN target shows in the result, also where no later iterate is better
     const Value u = hold(target, guess + (target - target));
     return project(contacts, u, u);
   }
 
   // the first iterate from the current position
-  PD_HD Value still(const Contacts<Real>& contacts) const {
+  PD_HD Value current_iterate(const Contacts<Real>& contacts) const {
     const Real none(T(0));
-    return first(contacts, Lanes::value({none, none, none}));
+    return first_iterate(contacts, Lanes::value({none, none, none}));
   }
 
   // u plus the `displacement` of a rigid motion. A zero displacement keeps all bits, also the sign of a zero.
-  PD_HD Value moved(const Value& u, const Vec3<Real>& way) const {
-    return select(!(dot(way, way) <= Real(T(0))), hold(u, u + Lanes::value(way)), u);
+  PD_HD Value displaced(const Value& u, const Vec3<Real>& displacement) const {
+    return select(!(dot(displacement, displacement) <= Real(T(0))),
+                  hold(u, u + Lanes::value(displacement)), u);
   }
 
   // dE/du, from `force` = dE_elastic/du
@@ -124,34 +125,35 @@ struct Vertex {
 
   // the part of dE/du that neither a pin nor a contact balances: D times the displacement of a plain iteration
   template <class Obstacles>
-  PD_HD Value unbalanced(const Obstacles& contacts, const Value& u, const Value& force) const {
+  PD_HD Value residual(const Obstacles& contacts, const Value& u, const Value& force) const {
     const Real none(T(0)), one(T(1));
     const Value zero = Lanes::value({none, none, none}), free = gradient(u, force);
-    if constexpr (!Touching) return hold(zero, free);
+    if constexpr (!HasContacts) return hold(zero, free);
     const Real diagonal = one / select(inverse > none, inverse, one);
     return hold(zero, diagonal * (u - project(contacts, subtract_product(u, inverse, free), u)));
   }
 
   // the free directions at u: see contact/plane_sphere.h
-  PD_HD Leeway<Real> leeway(const Contacts<Real>& contacts, const Value& u,
-                            const Value& force) const {
-    return contacts.leeway(Lanes::vec3(x),
-                           Lanes::vec3(subtract_product(u, inverse, gradient(u, force))),
-                           Lanes::vec3(u));
+  PD_HD ContactProjector<Real> contact_projector(const Contacts<Real>& contacts, const Value& u,
+                                                 const Value& force) const {
+    return contacts.contact_projector(Lanes::vec3(x),
+                                      Lanes::vec3(subtract_product(u, inverse, gradient(u, force))),
+                                      Lanes::vec3(u));
   }
 
   // the friction force, from the slip that friction takes back
-  PD_HD Value friction(const Vec3<Real>& taken) const {
+  PD_HD Value friction_force(const Vec3<Real>& slip) const {
     const Real none(T(0)), one(T(1)), diagonal = one / select(inverse > none, inverse, one);
-    return hold(Lanes::value({none, none, none}), Lanes::value(diagonal * taken));
+    return hold(Lanes::value({none, none, none}), Lanes::value(diagonal * slip));
   }
 
   // a trial `next` projected out of the contacts, from u with dE/du = `slope`: see contact/plane_sphere.h
-  PD_HD Value land(const Contacts<Real>& contacts, const Value& next, const Value& u,
-                   const Value& slope) const {
-    if constexpr (!Touching) return next;
+  PD_HD Value project_trial(const Contacts<Real>& contacts, const Value& next, const Value& u,
+                            const Value& slope) const {
+    if constexpr (!HasContacts) return next;
     const Vec3<Real> free = Lanes::vec3(subtract_product(u, inverse, slope));
-    return Lanes::value(contacts.land(Lanes::vec3(x), free, Lanes::vec3(u), Lanes::vec3(next)));
+    return Lanes::value(
+        contacts.project_trial(Lanes::vec3(x), free, Lanes::vec3(u), Lanes::vec3(next)));
   }
 };
 

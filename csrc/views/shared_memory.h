@@ -27,9 +27,9 @@ constexpr std::size_t slots_bytes(std::size_t real, std::size_t slots, std::size
 // a pair, and the rows of planes and spheres.
 constexpr std::size_t fused_shared_bytes(std::size_t real, bool many, std::size_t slots,
                                          std::size_t entries, std::size_t planes,
-                                         std::size_t balls) {
+                                         std::size_t spheres) {
   return fused_control_bytes + slots_bytes(real, slots, 1) * (many ? 1 : 2) +
-         real * (4 * entries + planes_numbers * planes + spheres_numbers * balls);
+         real * (4 * entries + planes_numbers * planes + spheres_numbers * spheres);
 }
 
 // Most blocks of a cluster, and the memory of each block for sums (cuda/common/cluster_sums.h).
@@ -48,14 +48,14 @@ constexpr std::size_t cluster_energy_bytes = 512 * sizeof(double);
 // The part before x, velocity, target, u, before and origin of a block's own vertices, which follow.
 constexpr std::size_t cluster_vertices_begin(std::size_t real, std::size_t slots,
                                              std::size_t entries, std::size_t planes,
-                                             std::size_t balls) {
+                                             std::size_t spheres) {
   return fused_control_bytes + cluster_sums_bytes + cluster_energy_bytes + halo_bytes(real, slots) +
-         aligned(real * (2 * 4 * entries + planes_numbers * planes + spheres_numbers * balls));
+         aligned(real * (2 * 4 * entries + planes_numbers * planes + spheres_numbers * spheres));
 }
 constexpr std::size_t cluster_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                            std::size_t interior, std::size_t planes,
-                                           std::size_t balls) {
-  return cluster_vertices_begin(real, slots, entries, planes, balls) + 6 * 4 * real * interior;
+                                           std::size_t spheres) {
+  return cluster_vertices_begin(real, slots, entries, planes, spheres) + 6 * 4 * real * interior;
 }
 
 // Threads of a block with one of several patches.

@@ -27,10 +27,10 @@ enum PlanSize : int {
 // Entries of a preconditioner's array of sizes; without a middle level its entries are 0.
 enum LevelSize : int {
   level_fine_entries,
-  level_fine_lifts,
+  level_fine_prolongations,
   level_fine_nodes,  // below the fine level
   level_middle_entries,
-  level_middle_lifts,
+  level_middle_prolongations,
   level_middle_nodes,  // below the middle level
   level_direct,        // 1: no levels, A itself is solved directly
   level_size_count
@@ -227,7 +227,7 @@ struct FieldCall {
 // Sums over the vertices of an environment for a report, see solver/report.h.
 enum ReportSum : int {
   report_energy,
-  report_unbalanced,
+  report_residual,
   report_force,
   report_rounding,
   report_inverted,
@@ -343,7 +343,7 @@ enum FrictionProgress : int {
   friction_stage,
   friction_product,
   friction_error,
-  friction_left,
+  friction_products_left,
   friction_count
 };
 

@@ -114,7 +114,7 @@ class Tables:
                 (
                     csr_array((t["fine_value"], t["fine_column"], t["fine_start"]), shape=(count, count)),
                     t["fine_inverse"].reshape(-1, 1),
-                    self._blocks(t, "fine_lift", 1, (count, 4 * nodes)),
+                    self._blocks(t, "fine_prolongation", 1, (count, 4 * nodes)),
                 )
             )
         if below:
@@ -124,7 +124,7 @@ class Tables:
                 (
                     csr_array(bsr_array((value, t["middle_column"], t["middle_start"]), shape=shape)),
                     t["middle_inverse"].reshape(-1, 1),
-                    self._blocks(t, "middle_lift", 4, (4 * nodes, 4 * below)),
+                    self._blocks(t, "middle_prolongation", 4, (4 * nodes, 4 * below)),
                 )
             )
         size = count if direct else 4 * (below or nodes)

@@ -65,9 +65,9 @@ def test_lifts_of_a_gpu_have_smoothing_in_them(name: str) -> None:
     for kind, height, (matrix, inverse, lift) in zip(("fine", "middle"), (1, 4), levels, strict=False):
         rng = np.random.default_rng(0)
         below, above = (rng.standard_normal((count, 3)) for count in lift.shape[::-1])
-        t = {key: found[f"{kind}_{key}"] for key in ("lift_start", "lift_node", "lift_weight")}
-        t |= {key: found[f"{kind}_{key}"] for key in ("node_start", "node_row", "node_weight", "node_lift")}
-        rows = bsr_array((t["lift_weight"].reshape(-1, height, 4), t["lift_node"], t["lift_start"]), shape=lift.shape)
+        t = {key: found[f"{kind}_{key}"] for key in ("prolongation_start", "prolongation_node", "prolongation_weight")}
+        t |= {key: found[f"{kind}_{key}"] for key in ("node_start", "node_row", "node_weight", "node_prolongation")}
+        rows = bsr_array((t["prolongation_weight"].reshape(-1, height, 4), t["prolongation_node"], t["prolongation_start"]), shape=lift.shape)
         weight = t["node_weight"].reshape(-1, height, 4).transpose(0, 2, 1)
         nodes = bsr_array((weight, t["node_row"], t["node_start"]), shape=lift.shape[::-1])
         image = lift @ below
@@ -75,8 +75,8 @@ def test_lifts_of_a_gpu_have_smoothing_in_them(name: str) -> None:
         assert np.linalg.norm(rows @ below - expected) <= 1e-13 * np.linalg.norm(image)
         smoothed = lift.T @ (above - matrix @ Tables.smooth(matrix, inverse, above))
         assert np.linalg.norm(nodes @ above - smoothed) <= 1e-13 * np.linalg.norm(lift.T @ above)
-        assert len(t["node_lift"]) == 0
-        assert len(t["lift_node"]) == found["level_sizes"][{"fine": 1, "middle": 4}[kind]]
+        assert len(t["node_prolongation"]) == 0
+        assert len(t["prolongation_node"]) == found["level_sizes"][{"fine": 1, "middle": 4}[kind]]
 
 
 def test_a_direct_one_is_the_inverse(dtype: torch.dtype) -> None:
@@ -218,11 +218,11 @@ def test_arrays_are_those_of_the_table(dtype: torch.dtype) -> None:
             assert array.shape[1:] == ((row.width,) if row.width > 1 else ()), row.name
         sizes = plan.level_sizes.tolist()
         assert sizes[0] == len(plan.fine_column) == int(plan.fine_start[-1])
-        assert sizes[1] == len(plan.fine_lift_node) == int(plan.fine_node_start[-1])
+        assert sizes[1] == len(plan.fine_prolongation_node) == int(plan.fine_node_start[-1])
         assert sizes[2] == len(plan.fine_node_start) - 1
         middle = bool(sizes[5])
         assert sizes[3] == len(plan.middle_column)
-        assert sizes[4] == len(plan.middle_lift_node)
+        assert sizes[4] == len(plan.middle_prolongation_node)
         assert sizes[5] == (len(plan.middle_node_start) - 1 if middle else 0)
         moved = plan.to("meta")
         on_cpu = [row.name for row, array in zip(moved.table, moved.arrays, strict=True) if array.device.type == "cpu"]

@@ -12,28 +12,28 @@ namespace pd::inline PD_TARGET {
 
 // The rotation Jacobian of every element: nine numbers of the rotation and nine of the inverse, in blocks of lanes.
 template <class T>
-class Turnings {
+class RotationJacobians {
   static constexpr int W = native_width<T>, numbers = 18;
 
  public:
-  explicit Turnings(const Plan<T>& plan)
+  explicit RotationJacobians(const Plan<T>& plan)
       : storage_(allocate_zeroed(std::int64_t(plan.blocks) * block_lanes * numbers * sizeof(T))),
         data_(reinterpret_cast<T*>(storage_.get())) {}
 
-  void set(const BlockPart<T>& part, const Turning<Pack<T, W>>& turning) {
-    each(part, turning, [](auto& number, T* at) { number.store(at); });
+  void set(const BlockPart<T>& part, const RotationJacobian<Pack<T, W>>& jacobian) {
+    each(part, jacobian, [](auto& number, T* at) { number.store(at); });
   }
-  Turning<Pack<T, W>> get(const BlockPart<T>& part) const {
-    Turning<Pack<T, W>> turning;
-    each(part, turning, [](auto& number, T* at) { number = Pack<T, W>::load(at); });
-    return turning;
+  RotationJacobian<Pack<T, W>> get(const BlockPart<T>& part) const {
+    RotationJacobian<Pack<T, W>> jacobian;
+    each(part, jacobian, [](auto& number, T* at) { number = Pack<T, W>::load(at); });
+    return jacobian;
   }
 
  private:
   template <class Any, class Visit>
-  void each(const BlockPart<T>& part, Any& turning, const Visit& visit) const {
+  void each(const BlockPart<T>& part, Any& jacobian, const Visit& visit) const {
     T* at = data_ + std::int64_t(part.block) * block_lanes * numbers + part.first_lane;
-    for (auto* matrix : {&turning.rotation, &turning.answer}) {
+    for (auto* matrix : {&jacobian.rotation, &jacobian.inverse}) {
       for (auto& row : matrix->row) {
         for (auto* number : {&row.x, &row.y, &row.z}) {
           visit(*number, at);
@@ -68,12 +68,12 @@ struct FrictionVectors {
 template <class T>
 struct ConjugateMemory {
   Workspace<Single<T>> vectors;
-  Turnings<T> turnings;
+  RotationJacobians<T> jacobians;
   std::unique_ptr<Cycle<Single<T>>> cycle;  // null without levels
   FrictionVectors<T> friction;
 
   explicit ConjugateMemory(const ConjugateCall<T>& call)
-      : vectors(call), turnings(call.plan), friction(call.friction ? call.plan.vertices : 0) {
+      : vectors(call), jacobians(call.plan), friction(call.friction ? call.plan.vertices : 0) {
     if (call.plan.levels.there()) cycle = std::make_unique<Cycle<Single<T>>>(call.plan.levels);
   }
 };
@@ -89,7 +89,7 @@ class ConjugatePass {
       : call_(call),
         plan_(call.plan),
         w_(work.vectors),
-        turnings_(work.turnings),
+        jacobians_(work.jacobians),
         cycle_(work.cycle.get()),
         f_(work.friction),
         team_(team),
@@ -146,13 +146,14 @@ class ConjugatePass {
     team_.barrier();
     sweep_.set_origins();
     team_.barrier();
-    const auto turn = one_by_one([&](const auto& elements, int s) {
+    const auto differentiate = one_by_one([&](const auto& elements, int s) {
       using R = typename std::remove_cvref_t<decltype(elements)>::R;
       Vec3<R> x[4];
       elements.corners(s, 0, x);
-      turnings_.set(elements.part(s), Turning<R>(deformation_gradient(x, elements.rest(s))));
+      jacobians_.set(elements.part(s),
+                     RotationJacobian<R>(deformation_gradient(x, elements.rest(s))));
     });
-    sweep_.run(0, turn, [](std::int64_t, const Quad<T>&, Sum&) {});
+    sweep_.run(0, differentiate, [](std::int64_t, const Quad<T>&, Sum&) {});
   }
 
   void begin(Conjugate& numbers) {
@@ -177,7 +178,7 @@ class ConjugatePass {
       using R = typename std::remove_cvref_t<decltype(elements)>::R;
       Vec3<R> dx[4], g[4];
       elements.corners(s, 1, dx);
-      solid_hessian_product(turnings_.get(elements.part(s)), dx, elements.rest(s),
+      solid_hessian_product(jacobians_.get(elements.part(s)), dx, elements.rest(s),
                             elements.weight(s), g);
       elements.add(s, g);
     });
@@ -202,9 +203,9 @@ class ConjugatePass {
       sums.second = multiply_add(rest, w_.inverse[i] * rest, sums.second);
     });
     const auto sum = total(1);
-    numbers.judge(sum.first, call_.tolerance);
+    numbers.check_residual(sum.first, call_.tolerance);
     if (!numbers.active) return;
-    const T keep = T(numbers.keep(cycle_ ? apply_levels() : sum.second));
+    const T keep = T(numbers.direction_ratio(cycle_ ? apply_levels() : sum.second));
     // not part by part: others may still read the sums
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       direction()[i] = multiply_add(keep, direction()[i], preconditioned_residual(i));
@@ -213,7 +214,8 @@ class ConjugatePass {
 
   // Continues with BiCGStab where vertices slide, after so many products; returns whether it has.
   bool solve_friction(const Conjugate& numbers, int products) {
-    if (!call_.friction || !adds_friction(numbers, call_.tolerance) || !some_slide()) return false;
+    if (!call_.friction || !continues_with_friction(numbers, call_.tolerance) || !some_slide())
+      return false;
     FrictionSolve friction(nullptr, numbers.scale);
     friction.begin(products, adjoint_iterations);
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
@@ -241,7 +243,7 @@ class ConjugatePass {
       return w_.inverse[i] * (stage == FrictionStage::first ? f_.search : residual())[i];
     };
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
-      direction()[i] = Lanes::value(press(to_vec3(z(i)), sliding(i)));
+      direction()[i] = Lanes::value(transposed_friction(to_vec3(z(i)), sliding(i)));
     team_.barrier();
     multiply([&](std::int64_t i, const Quad<T>& force, Sum& sums) {
       const Quad<T> product =
@@ -263,7 +265,8 @@ class ConjugatePass {
     const auto sum = total(0);
     if (stage == FrictionStage::residual) return correct(friction, sum.first);
     const bool first = stage == FrictionStage::first;
-    const T step = T(first ? friction.go(sum.first) : friction.smooth(sum.first, sum.second));
+    const T step =
+        T(first ? friction.search_step(sum.first) : friction.residual_step(sum.first, sum.second));
     if (first && friction.stage == FrictionStage::residual) return;
     const Quad<T>* const product = first ? image() : f_.smoothed;
     each_part([&](std::int64_t i, Sum& sums) {
@@ -275,7 +278,7 @@ class ConjugatePass {
     });
     if (first) return;
     const auto left = total(1);
-    const T keep = T(friction.judge(left.first, left.second, call_.tolerance));
+    const T keep = T(friction.finish_iteration(left.first, left.second, call_.tolerance));
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       f_.search[i] =
           multiply_add(keep, subtract_product(f_.search[i], step, image()[i]), residual()[i]);
@@ -341,7 +344,8 @@ class ConjugatePass {
   // `slides`: the multiplier is G^T of what was solved for
   void store(bool slides) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      if (slides) solution()[i] = Lanes::value(press(to_vec3(solution()[i]), sliding(i)));
+      if (slides)
+        solution()[i] = Lanes::value(transposed_friction(to_vec3(solution()[i]), sliding(i)));
       write(call_.solution, i, unit_ * solution()[i]);
       write(call_.residual, i, unit_ * residual()[i]);
       write(call_.direction, i, unit_ * direction()[i]);
@@ -388,7 +392,7 @@ class ConjugatePass {
   const ConjugateCall<T>& call_;
   const Plan<T>& plan_;
   Workspace<Lanes>& w_;
-  Turnings<T>& turnings_;
+  RotationJacobians<T>& jacobians_;
   const Cycle<Lanes>* cycle_;
   FrictionVectors<T>& f_;
   const Team& team_;

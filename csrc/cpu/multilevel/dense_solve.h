@@ -58,7 +58,7 @@ class Dense {
         sum[c] = multiply_add(Real(numbers[j + c]), x[j + c], sum[c]);
     }
     for (int c = 0; j + c <= i; ++c) sum[c] = multiply_add(Real(numbers[j + c]), x[j + c], sum[c]);
-    return join(sum);
+    return sum_chains(sum);
   }
 
   // Rows i ... i + 3, i a multiple of four. Up to number i a vector holds the chains of a row side by side.

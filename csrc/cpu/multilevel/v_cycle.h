@@ -91,7 +91,7 @@ class Cycle {
     each_row(team, level, [&](int row, std::int64_t at) {
       Value sum[B];
       for (int i = 0; i < B; ++i) sum[i] = f.z[at + i];
-      add_lift<Real>(level, below_out, row, sum);
+      add_prolongation<Real>(level, below_out, row, sum);
       for (int i = 0; i < B; ++i) f.z[at + i] = sum[i];
     });
     each_row(team, level, [&](int row, std::int64_t at) {

@@ -33,7 +33,7 @@ void begin_still(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
     const auto v = vertex(i);
     const auto vec3 = [](const auto& a) { return Lanes::vec3(a); };
     add_start(w.group_sums[g].start, contacts, vec3(v.x), vec3(v.target), v.inertia, v.inverse,
-              vec3(w.u[i]), vec3(v.still(contacts)), vec3(w.u[i] - guess(i)));
+              vec3(w.u[i]), vec3(v.current_iterate(contacts)), vec3(w.u[i] - guess(i)));
   });
   bool some = false;
   for (int g = 0; g < plan.groups; ++g) {
@@ -52,7 +52,8 @@ void begin_still(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     if (!w.group_sums[g].still) return;
     const auto stays = w.still[g] > none;
-    const Vec3<Real> u = Lanes::vec3(w.u[i]), still = Lanes::vec3(vertex(i).still(contacts));
+    const Vec3<Real> u = Lanes::vec3(w.u[i]),
+                     still = Lanes::vec3(vertex(i).current_iterate(contacts));
     w.u[i] = Lanes::value(
         {select(stays, still.x, u.x), select(stays, still.y, u.y), select(stays, still.z, u.z)});
   });
@@ -275,7 +276,7 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
   }
   while (contacts.plane_count > 0 && tip_motions(plan, w, contacts)) {
   }
-  if (!contacts.has_several()) return;
+  if (!contacts.has_multiple()) return;
   // what is left must not lead into other contacts
   for (int g = 0; g < plan.groups; ++g) w.group_sums[g].gaps[0] = Wide(HUGE_VAL);
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
@@ -295,13 +296,13 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
 }
 
 // Motions of all pieces, in one leg; whether some go on in another.
-template <bool Touching, class Lanes>
+template <bool HasContacts, class Lanes>
 bool find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
                   const Contacts<typename Lanes::Real>& contacts, bool first, int leg) {
   sum_pieces(plan, w);
   free_motions(plan, w, leg);
   bool some = false;
-  if constexpr (Touching) {
+  if constexpr (HasContacts) {
     limit_motions(plan, w, contacts, first);
     for (int n = 0; n < plan.groups * Lanes::environments; ++n) some = some || w.goes_on[n];
   }

@@ -58,7 +58,7 @@ struct Workspace {
   bool* goes_on;                   // [groups, environments] moves in this leg, then: in the next
   TippingSearch<Real>* search;     // [groups]
   Plane<Real>* planes;
-  Ball<Real>* balls;
+  Sphere<Real>* spheres;
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
   int part_count;
   bool shared_weight;
@@ -106,7 +106,7 @@ struct Workspace {
     place(search, tipping_groups, base);
     place(goes_on, plan.groups * Lanes::environments, base);
     place(planes, material.planes_count, base);
-    place(balls, material.spheres_count, base);
+    place(spheres, material.spheres_count, base);
     place(weight,
           std::int64_t(plan.blocks) * block_lanes * (shared_weight ? 1 : Lanes::environments),
           base);

@@ -184,7 +184,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, HasContacts> v, Contacts<T> contacts,
     double sum[StartSums::count] = {}, back[3] = {};
     part.each([&](int i) {
       const auto vertex = v.at(i);
-      const Vec3<T> u = vec3(v.u[i]), still = vertex.still(contacts);
+      const Vec3<T> u = vec3(v.u[i]), still = vertex.current_iterate(contacts);
       add_start(sum, contacts, vertex.x, vertex.target, vertex.inertia, vertex.inverse, u, still,
                 u - v.predicted(i, settings));
       const Vec3<double> way = double(vertex.inertia) * (wide(still) - wide(u));

@@ -13,7 +13,7 @@ namespace pd {
 // A warp accesses one corner, 16 bytes a lane, in four phases of 8 lanes. A phase takes as many passes as lanes
 // conflict in a bank; slots with the same remainder by 8 conflict, and so do their entries. The corners of `pairs`
 // are slots. This changes the order of pairs, of the corners of their common face, and of their two tetrahedra.
-void spread_banks(std::vector<Pair>& pairs);
+void reduce_bank_conflicts(std::vector<Pair>& pairs);
 
 // Slots per slice; the entries of a slot lie so many places apart.
 constexpr int entry_slice = 8;

@@ -148,7 +148,7 @@ Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplin
   return graph;
 }
 
-std::int32_t connected_pieces(const Graph& graph, const std::vector<std::uint8_t>& left_out) {
+std::int32_t connected_components(const Graph& graph, const std::vector<std::uint8_t>& left_out) {
   Fronts fronts(graph);
   std::vector<std::int32_t> centres;
   join_nearest(fronts, centres, left_out);

@@ -25,7 +25,7 @@ struct Graph {
 Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplings);
 
 // Number of connected components of the graph without the vertices `left_out`.
-std::int32_t connected_pieces(const Graph& graph, const std::vector<std::uint8_t>& left_out);
+std::int32_t connected_components(const Graph& graph, const std::vector<std::uint8_t>& left_out);
 
 // Aggregate of each vertex, -1 where `left_out`, and their count: about `wanted`, more if the graph has more
 // components. Six sweeps: every vertex joins the nearest centre, then every centre moves to the deepest vertex of its

@@ -53,7 +53,7 @@ struct Conjugate {
   }
 
   // whether the residual r needs more iterations, by |r|^2
-  PD_HD void judge(double square, double tolerance) {
+  PD_HD void check_residual(double square, double tolerance) {
     const double residual = sqrt(square);
     active = residual > tolerance * scale;
     // a NaN on the way is an error, however large
@@ -61,7 +61,7 @@ struct Conjugate {
   }
 
   // factor of the last direction in the next one (beta), from r . z
-  PD_HD double keep(double next) {
+  PD_HD double direction_ratio(double next) {
     const double ratio = next / product;
     product = next;
     return ratio;

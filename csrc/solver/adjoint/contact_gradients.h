@@ -22,7 +22,7 @@ class ContactGradients {
   PD_HD ContactGradients(const ContactGradientsCall<T, P>& call, const AdjointVertex<T, P>& vertex)
       : call_(call), vertex_(vertex) {}
 
-  PD_HD void give() {
+  PD_HD void differentiate() {
     const T weight = vertex_.inertia(vertex_.spring());
     const HeldVertex<T> held = vertex_.hold(weight, [&](const ContactAt<T>& contact) {
       // three normals span all others, but for rounding
@@ -34,8 +34,9 @@ class ContactGradients {
     if (count_ == 0) return;
     // H keeps, in all directions, the curvature term that several contacts let through
     const T inertia = weight - (count_ > 1 ? held.curvature : T(0));
-    const Vec3<T> q = subtract_product(vertex_.asked() - vertex_.read(call_.elastic), inertia, l);
-    count_ == 1 ? give_one(held, l, q) : give_several(held, l, q);
+    const Vec3<T> q =
+        subtract_product(vertex_.loss_gradient() - vertex_.read(call_.elastic), inertia, l);
+    count_ == 1 ? differentiate_single(held, l, q) : differentiate_multiple(held, l, q);
   }
 
  private:
@@ -77,70 +78,74 @@ class ContactGradients {
     to[spheres_motion + 2] = motion.z;
   }
 
-  // `turning`: the tangential factor of the rotation of its normal.
-  PD_HD void write_turning(const HeldVertex<T>& held, const ContactAt<T>& contact,
-                           const Vec3<T>& turning, T lambda, T friction,
-                           const Vec3<T>& motion) const {
+  // `rotation_factor`: the tangential factor of the rotation of its normal.
+  PD_HD void write_rotating(const HeldVertex<T>& held, const ContactAt<T>& contact,
+                            const Vec3<T>& rotation_factor, T lambda, T friction,
+                            const Vec3<T>& motion) const {
     const Vec3<T>& n = contact.normal;
-    const Vec3<T> first = is_plane(contact)
-                              ? tangential(subtract_product(turning, lambda, held.position), n)
-                              : subtract_product(lambda * n, contact.curved, turning);
+    const Vec3<T> first =
+        is_plane(contact) ? tangential(subtract_product(rotation_factor, lambda, held.position), n)
+                          : subtract_product(lambda * n, contact.inverse_distance, rotation_factor);
     write(contact, first, lambda, friction, motion);
   }
 
-  PD_HD void give_one(const HeldVertex<T>& held, const Vec3<T>& l, const Vec3<T>& q) const {
+  PD_HD void differentiate_single(const HeldVertex<T>& held, const Vec3<T>& l,
+                                  const Vec3<T>& q) const {
     const ContactAt<T>& by = by_[0];
     const Vec3<T>& n = by.normal;
     const Vec3<T> w = held.moved - by.motion, none = {T(0), T(0), T(0)};
-    const T lambda = dot(n, q), along = dot(n, w), push = dot(n, held.residual);
+    const T lambda = dot(n, q), along = dot(n, w), normal_force = dot(n, held.residual);
     if (held.stuck) {
       const Vec3<T> rest = tangential(q, n), carried = held.carried * rest;
-      if (is_plane(by)) return write_turning(held, by, along * q, lambda, T(0), none);
+      if (is_plane(by)) return write_rotating(held, by, along * q, lambda, T(0), none);
       return write(by, multiply_add(lambda, n, rest - carried), lambda, T(0), carried);
     }
     const Vec3<T> y = tangential(l, n), slip = tangential(w, n);
     const T slipped = square_root(dot(slip, slip));
     // on a smooth surface at rest, rounding alone would decide the direction of slip
-    const bool slides = by.friction > T(0) || !held.holds(slipped, push);
+    const bool slides = by.friction > T(0) || !held.holds(slipped, normal_force);
     const Vec3<T> d = (slipped > T(0) && slides ? T(1) / slipped : T(0)) * slip;
-    const T back = dot(d, l), rub = by.friction * push;
+    const T back = dot(d, l), friction_bound = by.friction * normal_force;
     // across is the third direction, times the square root of kappa
     const Vec3<T>& across = held.slides[slide_across];
     const Vec3<T> turned = dot(across, l) * across;
-    const Vec3<T> turning =
-        multiply_add(push, y, multiply_add(by.friction * rub * back, d, along * turned));
-    write_turning(held, by, turning, lambda, -push * back, turned);
+    const Vec3<T> rotation_factor = multiply_add(
+        normal_force, y, multiply_add(by.friction * friction_bound * back, d, along * turned));
+    write_rotating(held, by, rotation_factor, lambda, -normal_force * back, turned);
   }
 
   // Along the edge of two planes a vertex may slide against friction; all else is smooth here, as in HeldVertex.
-  PD_HD void give_several(const HeldVertex<T>& held, const Vec3<T>& l, const Vec3<T>& q) const {
+  PD_HD void differentiate_multiple(const HeldVertex<T>& held, const Vec3<T>& l,
+                                    const Vec3<T>& q) const {
     const bool edge = count_ == 2 && held.curvature == T(0);
     const Vec3<T> c = cross(by_[0].normal, by_[1].normal);
     const T size = square_root(dot(c, c));
     // the rotation of the edge, which is the only direction of the slip
-    Vec3<T> turns = {T(0), T(0), T(0)}, d = turns;
-    T rub(0);
+    Vec3<T> edge_rotation = {T(0), T(0), T(0)}, d = edge_rotation;
+    T friction_bound(0);
     if (edge && !held.stuck) {
       const Vec3<T> slip = held.projector * held.moved;
       const T slipped = square_root(dot(slip, slip));
       if (slipped > T(0)) d = (T(1) / slipped) * slip;
       for (int k = 0; k < 2; ++k)
-        rub = multiply_add(by_[k].friction, dot(dual(k), held.residual), rub);
-      const T way = dot(d, c) < T(0) ? -rub : rub;
-      turns = (way / size) * subtract_product(l, dot(d, l), d);
+        friction_bound = multiply_add(by_[k].friction, dot(dual(k), held.residual), friction_bound);
+      const T signed_bound = dot(d, c) < T(0) ? -friction_bound : friction_bound;
+      edge_rotation = (signed_bound / size) * subtract_product(l, dot(d, l), d);
     } else if (edge) {
-      turns = (dot(c, q) / (size * size)) * held.moved;
+      edge_rotation = (dot(c, q) / (size * size)) * held.moved;
     }
     for (int k = 0; k < count_; ++k) {
       const ContactAt<T>& by = by_[k];
       const Vec3<T> m = dual(k);
-      const T lambda = dot(m, q), push = dot(m, held.residual);
-      Vec3<T> turning = push * tangential(l, by.normal);
+      const T lambda = dot(m, q), normal_force = dot(m, held.residual);
+      Vec3<T> rotation_factor = normal_force * tangential(l, by.normal);
       if (edge)
-        turning = turning - (k == 0 ? cross(by_[1].normal, turns) : cross(turns, by_[0].normal));
+        rotation_factor = rotation_factor - (k == 0 ? cross(by_[1].normal, edge_rotation)
+                                                    : cross(edge_rotation, by_[0].normal));
       const bool carries = held.stuck && by.number == held.sticks_to;
       const Vec3<T> motion = (carries ? T(1) : T(0)) * (held.projector * q);
-      write_turning(held, by, turning, lambda, edge ? -push * dot(d, l) : T(0), motion);
+      write_rotating(held, by, rotation_factor, lambda, edge ? -normal_force * dot(d, l) : T(0),
+                     motion);
     }
   }
 

@@ -43,7 +43,7 @@ constexpr double friction_enough = 10;
 // One environment's numbers between products, as in FrictionProgress. `scale`: |right side|.
 struct FrictionSolve {
   double scale, product = 0, error = 0;
-  int left = 0;  // products left; those of the symmetric part before
+  int products_left = 0;  // products products_left; those of the symmetric part before
   FrictionStage stage = FrictionStage::done;
   double step = 0, weight = 0;
 
@@ -52,20 +52,20 @@ struct FrictionSolve {
     if (!from) return;
     product = from[friction_product];
     error = from[friction_error];
-    left = int(from[friction_left]);
+    products_left = int(from[friction_products_left]);
     stage = FrictionStage(int(from[friction_stage]));
   }
 
   PD_HD void write(double* to) const {
     to[friction_product] = product;
     to[friction_error] = error;
-    to[friction_left] = left;
+    to[friction_products_left] = products_left;
     to[friction_stage] = int(stage);
   }
 
   PD_HD bool active() const { return stage != FrictionStage::done; }
   // whether a launch may end here: the vectors of an iteration are not kept
-  PD_HD bool pauses() const { return stage != FrictionStage::second; }
+  PD_HD bool may_pause() const { return stage != FrictionStage::second; }
 
   PD_HD void scale_by(double factor) {
     product *= factor * factor;
@@ -74,7 +74,7 @@ struct FrictionSolve {
 
   // after the solve of the symmetric part, which took so many products
   PD_HD void begin(int products, int most) {
-    left = products > most / friction_products ? most : friction_products * products;
+    products_left = products > most / friction_products ? most : friction_products * products;
     error = HUGE_VAL;
     stage = FrictionStage::residual;
   }
@@ -83,7 +83,8 @@ struct FrictionSolve {
   PD_HD bool accept(double square, double tolerance) {
     const double found = sqrt(square) / scale;
     const bool better = found < error;
-    const bool again = 2 * found < error && found > friction_enough * tolerance && left > 0;
+    const bool again =
+        2 * found < error && found > friction_enough * tolerance && products_left > 0;
     stage = again ? FrictionStage::first : FrictionStage::done;
     if (better) error = found;
     product = square;
@@ -91,26 +92,26 @@ struct FrictionSolve {
   }
 
   // step length along z = M p, from s . A z; s is the first residual of the cycle
-  PD_HD double go(double along) {
+  PD_HD double search_step(double along) {
     step = product / along;
     const bool finite = step < HUGE_VAL && step > -HUGE_VAL;
     stage = finite ? FrictionStage::second : FrictionStage::residual;
-    --left;
+    --products_left;
     return step;
   }
 
   // step length along z = M r, from A z . r and |A z|^2
-  PD_HD double smooth(double along, double square) {
+  PD_HD double residual_step(double along, double square) {
     weight = square > 0 ? along / square : 0;
     return weight;
   }
 
   // checks the recurrences' residual by |r|^2 and s . r; returns the factor of p in the next p
-  PD_HD double judge(double square, double next, double tolerance) {
+  PD_HD double finish_iteration(double square, double next, double tolerance) {
     const double residual = sqrt(square), keep = (next / product) * (step / weight);
     const bool finite = residual < HUGE_VAL && keep < HUGE_VAL && keep > -HUGE_VAL && keep != 0;
-    --left;
-    const bool goes_on = finite && residual > tolerance * scale && left > 0;
+    --products_left;
+    const bool goes_on = finite && residual > tolerance * scale && products_left > 0;
     stage = goes_on ? FrictionStage::first : FrictionStage::residual;
     product = next;
     return keep;
@@ -118,13 +119,13 @@ struct FrictionSolve {
 };
 
 // Whether BiCGStab follows the solve of the symmetric part.
-PD_HD bool adds_friction(const Conjugate& symmetric, double tolerance) {
+PD_HD bool continues_with_friction(const Conjugate& symmetric, double tolerance) {
   return !symmetric.active && symmetric.scale > 0 && symmetric.error <= adjoint_failed * tolerance;
 }
 
 // G^T z at a vertex; `p`: its vectors, see Slide.
 template <class T>
-PD_HD Vec3<T> press(const Vec3<T>& z, const T* p) {
+PD_HD Vec3<T> transposed_friction(const Vec3<T>& z, const T* p) {
   const T *along = p + 3 * slide_along, *normal = p + 3 * slide_normal;
   return multiply_add(dot(Vec3<T>{along[0], along[1], along[2]}, z),
                       Vec3<T>{normal[0], normal[1], normal[2]}, z);

@@ -16,7 +16,7 @@ constexpr double adjoint_failed = 1e3;
 constexpr int adjoint_iterations = 2000;  // at most
 
 // Slip below this share of what friction could take back counts as none.
-constexpr double sticking = 1e-3;
+constexpr double sticking_tolerance = 1e-3;
 
 // A contact at one vertex.
 template <class T>
@@ -25,7 +25,7 @@ struct ContactAt {
   Vec3<T> normal;
   T gap, friction;
   Vec3<T> motion;
-  T curved;  // 1 / distance to the centre of a sphere; 0 for planes
+  T inverse_distance;  // 1 / distance to the centre of a sphere; 0 for planes
 };
 
 // The contacts that hold a vertex of a solved step. A contact holds it if a plain iteration, x' - r / D, would
@@ -50,22 +50,22 @@ struct HeldVertex {
 
   // Returns whether the contact holds the vertex along a normal that earlier contacts do not span. A contact whose
   // normal they span adds nothing.
-  PD_HD bool touch(const ContactAt<T>& contact) {
+  PD_HD bool add_contact(const ContactAt<T>& contact) {
     const Vec3<T>&normal = contact.normal, &motion = contact.motion;
-    const T friction = contact.friction, curved = contact.curved;
-    const T push = dot(residual, normal);
-    if (!(push > T(0) && contact.gap < push / diagonal)) return false;
+    const T friction = contact.friction, inverse_distance = contact.inverse_distance;
+    const T normal_force = dot(residual, normal);
+    if (!(normal_force > T(0) && contact.gap < normal_force / diagonal)) return false;
     // orthogonalised, so that the product stays a projector
     const Vec3<T> left = projector * normal;
     const T size = dot(left, left);
-    if (!(size > T(spanned))) return false;
-    projector = take_off(projector, left, T(1) / size);
+    if (!(size > T(dependent_normal))) return false;
+    projector = project_off(projector, left, T(1) / size);
     const Vec3<T> slip = tangential(moved - motion, normal);
     const T slipped = square_root(dot(slip, slip));
-    const bool sticks = friction > T(0) && holds(slipped, friction * push);
+    const bool sticks = friction > T(0) && holds(slipped, friction * normal_force);
     stuck = stuck || sticks;
     if (sticks) sticks_to = contact.number;
-    curvature = multiply_add(push, curved, curvature);
+    curvature = multiply_add(normal_force, inverse_distance, curvature);
     for (Vec3<T>& of : slides) of = {T(0), T(0), T(0)};
     ++contacts;
     carried = T(1);
@@ -73,10 +73,10 @@ struct HeldVertex {
       first_normal = normal;
       first_friction = friction;
       // it ends where the line from the centre to its start, moved along, meets the sphere
-      const T begins = T(1) - curved * dot(moved - motion, normal);
+      const T begins = T(1) - inverse_distance * dot(moved - motion, normal);
       if (sticks && begins > T(0)) carried = T(1) / begins;
       if (friction > T(0) && !sticks)
-        slide_on(normal, push, friction, motion, curved, slip, slipped);
+        slide_on(normal, normal_force, friction, motion, inverse_distance, slip, slipped);
     } else if (contacts == 2 && curvature == T(0)) {
       slide_along_edge(normal, friction);
     }
@@ -84,16 +84,18 @@ struct HeldVertex {
   }
 
   // friction can take back more in one iteration than has slipped
-  PD_HD bool holds(T slipped, T most) const { return slipped * diagonal <= T(sticking) * most; }
+  PD_HD bool holds(T slipped, T most) const {
+    return slipped * diagonal <= T(sticking_tolerance) * most;
+  }
 
-  PD_HD void slide_on(const Vec3<T>& normal, T push, T friction, const Vec3<T>& motion, T curved,
-                      const Vec3<T>& slip, T slipped) {
+  PD_HD void slide_on(const Vec3<T>& normal, T normal_force, T friction, const Vec3<T>& motion,
+                      T inverse_distance, const Vec3<T>& slip, T slipped) {
     const T rate = T(1) / slipped, along = friction * rate;
     slides[slide_along] = along * slip;
     slides[slide_normal] = normal;
-    slides[slide_across] = (square_root(along * push) * rate) * cross(normal, slip);
-    slides[slide_bend] = (along * square_root(push * curved)) * slip;
-    slides[slide_lean] = (curved * dot(moved - motion, normal)) * slides[slide_across];
+    slides[slide_across] = (square_root(along * normal_force) * rate) * cross(normal, slip);
+    slides[slide_bend] = (along * square_root(normal_force * inverse_distance)) * slip;
+    slides[slide_lean] = (inverse_distance * dot(moved - motion, normal)) * slides[slide_across];
   }
 
   // Two planes, whose edge is the only direction of slip. Friction is the sum of both; r consists of their normal
@@ -102,46 +104,46 @@ struct HeldVertex {
     const T both = dot(first_normal, normal), share = T(1) / (T(1) - both * both);
     const Vec3<T> first = share * subtract_product(first_normal, both, normal);
     const Vec3<T> second = share * subtract_product(normal, both, first_normal);
-    const Vec3<T> rub = multiply_add(friction, second, first_friction * first);
+    const Vec3<T> friction_bound = multiply_add(friction, second, first_friction * first);
     const Vec3<T> slip = projector * moved;
-    const T slipped = square_root(dot(slip, slip)), force = dot(rub, residual);
+    const T slipped = square_root(dot(slip, slip)), force = dot(friction_bound, residual);
     if (!(force > T(0))) return;  // both are smooth
     stuck = stuck || holds(slipped, force);
     if (stuck) return;
     slides[slide_along] = (T(1) / slipped) * slip;
-    slides[slide_normal] = rub;
+    slides[slide_normal] = friction_bound;
   }
 };
 
 // adds(contact): of those by which `vertex` is held along one more normal.
 template <class T, class Adds>
-PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::int64_t environment,
-                     const Adds& adds) {
+PD_HD void find_contacts(HeldVertex<T>& vertex, const Material<T>& material,
+                         std::int64_t environment, const Adds& adds) {
   const Vec3<T>& x = vertex.position;
-  const auto touch = [&](const ContactAt<T>& contact) {
-    if (vertex.touch(contact)) adds(contact);
+  const auto add_contact = [&](const ContactAt<T>& contact) {
+    if (vertex.add_contact(contact)) adds(contact);
   };
   for (int c = 0; c < material.planes_count; ++c) {
     const T* p = material.planes.of(environment) + planes_numbers * c;
     const Vec3<T> normal = {p[0], p[1], p[2]};
-    touch({c,
-           normal,
-           dot(normal, x) - p[planes_height],
-           p[planes_friction],
-           {T(0), T(0), T(0)},
-           T(0)});
+    add_contact({c,
+                 normal,
+                 dot(normal, x) - p[planes_height],
+                 p[planes_friction],
+                 {T(0), T(0), T(0)},
+                 T(0)});
   }
   for (int c = 0; c < material.spheres_count; ++c) {
     const T* p = material.spheres.of(environment) + spheres_numbers * c;
     const Vec3<T> offset = x - Vec3<T>{p[0], p[1], p[2]};
     const T length = square_root(dot(offset, offset));
     if (!(length > T(0))) continue;
-    touch({material.planes_count + c,
-           (T(1) / length) * offset,
-           length - p[spheres_radius],
-           p[spheres_friction],
-           {p[spheres_motion], p[spheres_motion + 1], p[spheres_motion + 2]},
-           T(1) / length});
+    add_contact({material.planes_count + c,
+                 (T(1) / length) * offset,
+                 length - p[spheres_radius],
+                 p[spheres_friction],
+                 {p[spheres_motion], p[spheres_motion + 1], p[spheres_motion + 2]},
+                 T(1) / length});
   }
 }
 
@@ -199,7 +201,7 @@ struct AdjointVertex {
   }
 
   // dL/dx' + dL/dv' / h
-  PD_HD Vec3<T> asked() const {
+  PD_HD Vec3<T> loss_gradient() const {
     return multiply_add(T(1) / T(call.time_step), read(call.grad_velocities),
                         read(call.grad_positions));
   }
@@ -211,17 +213,17 @@ struct AdjointVertex {
     HeldVertex<T> held{after, after - read(call.positions), {T(0), T(0), T(0)}, diagonal(weight)};
     if (moves(weight)) {
       held.residual = residual(after, held.moved);
-      touch_all(held, call.material, environment, adds);
+      find_contacts(held, call.material, environment, adds);
     }
     return held;
   }
 
   // Writes the vertex's row of the system. A vertex held exactly, by a pin or by friction, gets zero right side and 1
   // / D.
-  PD_HD void solve_for() const {
+  PD_HD void write_system() const {
     const T weight = inertia(spring()), all = diagonal(weight);
     const bool free = moves(weight);
-    Vec3<T> right = free ? asked() : Vec3<T>{T(0), T(0), T(0)};
+    Vec3<T> right = free ? loss_gradient() : Vec3<T>{T(0), T(0), T(0)};
     T kept = free ? weight : T(0), inverse = free ? T(1) / all : T(0);
     if (call.projector) {
       const HeldVertex<T> held = hold(weight, [](const ContactAt<T>&) {});
@@ -264,7 +266,7 @@ struct AdjointVertex {
 // friction holds moves with its start. For one that slides, l has the friction term (solver/adjoint/friction.h),
 // unless that solve has failed. The result is NaN in an environment whose solve could not begin.
 template <class T>
-struct AdjointAnswer {
+struct AdjointResult {
   const AdjointResultCall<T>& call;
   std::int64_t environment, vertex;
 
@@ -282,7 +284,7 @@ struct AdjointAnswer {
     p[2] = a.z;
   }
 
-  PD_HD void give() const {
+  PD_HD void write() const {
     const T h = T(call.time_step), mass = call.masses.of(environment)[vertex];
     const double error = call.error[environment * call.error_stride];
     Vec3<T> multiplier = read(call.multiplier);

@@ -46,7 +46,7 @@ PD_HD void multilevel_step(Runner& run) {
   run.predict();
   run.start();
   run.align();
-  run.descend();  // multilevel_iterations
+  run.minimise();  // multilevel_iterations
   run.align();
   run.finish();
 }
@@ -57,16 +57,16 @@ PD_HD void multilevel_step(Runner& run) {
 template <class Runner>
 PD_HD void multilevel_iterations(Runner& run, const Settings& settings) {
   for (int k = 0;; ++k) {
-    run.evaluate(k);  // local step at the trial: energy and residual
-    run.judge(k);     // accept the trial, or go back
+    run.evaluate(k);          // local step at the trial: energy and residual
+    run.accept_or_reject(k);  // accept the trial, or go back
     if (k == settings.iterations) break;
-    run.learn(k);  // secant pair of the trial
+    run.update_pairs(k);  // secant pair of the trial
     if (run.finished()) break;
     // direction: M, corrected by the secant pairs
-    if (!run.goes_by_diagonal()) run.precondition();
-    run.advance();  // next trial, on the pins and out of the contacts
+    if (!run.uses_jacobi()) run.precondition();
+    run.next_trial();  // next trial, on the pins and out of the contacts
   }
-  run.settle();  // the last accepted trial
+  run.keep_best();  // the last accepted trial
 }
 
 constexpr int history = 8;                 // secant pairs that L-BFGS keeps
@@ -74,10 +74,10 @@ constexpr double least_curvature = 1e-12;  // least s.y of a pair, relative to |
 
 // L-BFGS (Nocedal 1980) in products of s and y, so that the vectors are read once before M and once after it. Pairs
 // form a ring buffer, one place a trial; a pair without positive curvature is not used.
-struct Pairs {
+struct SecantPairs {
   double product[history][history] = {};  // s_i . y_j, j not older than i
   double inverse[history] = {};           // 1 / s_i . y_i
-  double pulled[history] = {};            // s_i . g
+  double s_dot_g[history] = {};           // s_i . g
   double alpha[history] = {};
   bool valid[history] = {};  // the other arrays of an invalid pair may hold anything, NaN too
 
@@ -100,7 +100,7 @@ struct Pairs {
   PD_HD void first_loop(int newest) {
     for (int a = 0; a < history; ++a) {
       const int i = older(newest, a);
-      double rest = pulled[i];
+      double rest = s_dot_g[i];
       for (int b = 0; b < a; ++b) {
         const int j = older(newest, b);
         if (valid[j]) rest -= alpha[j] * product[i][j];
@@ -111,7 +111,7 @@ struct Pairs {
 
   // slope g.d of the direction; `own` is that of z
   PD_HD double slope(double own, const double (&c)[history]) const {
-    for (int i = 0; i < history; ++i) own += valid[i] ? c[i] * pulled[i] : 0;
+    for (int i = 0; i < history; ++i) own += valid[i] ? c[i] * s_dot_g[i] : 0;
     return own;
   }
 

@@ -19,20 +19,20 @@ struct Range {
   }
 };
 
-constexpr double known_inertia =
+constexpr double outlier_ratio =
     4;  // times the reference and the elements' change: vertices beyond are outliers
 
-struct Misfit {
-  double scale = 1;        // s of A <= s A_0, without outliers
-  double spread = 0;       // 1 - q / s for q A_0 <= A <= s A_0, with outliers
-  double trusted = 1;      // ratio of inertias that M can represent, within outlier_ratio
-  bool strangers = false;  // some vertices are outliers, or held by M alone
+struct MaterialMismatch {
+  double scale = 1;           // s of A <= s A_0, without outliers
+  double spread = 0;          // 1 - q / s for q A_0 <= A <= s A_0, with outliers
+  double trusted = 1;         // ratio of inertias that M can represent, within outlier_ratio
+  bool has_outliers = false;  // some vertices are outliers, or held by M alone
 
-  Misfit() = default;
+  MaterialMismatch() = default;
 
-  PD_HD Misfit(const Range& elements, const Range& inertias)
+  PD_HD MaterialMismatch(const Range& elements, const Range& inertias)
       : trusted(larger(elements.largest, smaller(inertias.least, inertias.largest))),
-        strangers(inertias.largest > known_inertia * trusted) {}
+        has_outliers(inertias.largest > outlier_ratio * trusted) {}
 
   // `common`: ratios of all vertices but outliers; `other_pins`: the step holds other vertices than M does
   PD_HD void conclude(const Range& elements, const Range& inertias, const Range& common,
@@ -40,7 +40,7 @@ struct Misfit {
     scale = larger(elements.largest, common.largest);
     const double least = smaller(elements.least, common.least);
     spread = other_pins ? 1 : 1 - least / larger(elements.largest, inertias.largest);
-    strangers = strangers || other_pins;
+    has_outliers = has_outliers || other_pins;
   }
 
   PD_HD static double larger(double a, double b) { return a < b ? b : a; }
@@ -55,7 +55,7 @@ constexpr int ranges_count = 2;  // ranges that threads reduce at a time
 #pragma nv_exec_check_disable
 #endif
 template <class Runner, class T>
-PD_HD Misfit measure_misfit(Runner& run, const Levels<T>& levels, const T* stiffness) {
+PD_HD MaterialMismatch measure_mismatch(Runner& run, const Levels<T>& levels, const T* stiffness) {
   Range first[ranges_count], second[ranges_count];
   Range &elements = first[0], &inertias = first[1], &common = second[0], &differ = second[1];
   run.each_tet([&](std::int64_t t) {
@@ -70,15 +70,15 @@ PD_HD Misfit measure_misfit(Runner& run, const Levels<T>& levels, const T* stiff
     });
   };
   each_inertia([&](double ratio) { inertias.count(ratio); });
-  run.meet(first);
-  Misfit misfit(elements, inertias);
-  const double most = known_inertia * misfit.trusted;
+  run.reduce(first);
+  MaterialMismatch mismatch(elements, inertias);
+  const double most = outlier_ratio * mismatch.trusted;
   each_inertia([&](double ratio) {
     if (!(ratio > most)) common.count(ratio);
   });
-  run.meet(second);
-  misfit.conclude(elements, inertias, common, differ.largest > 0);
-  return misfit;
+  run.reduce(second);
+  mismatch.conclude(elements, inertias, common, differ.largest > 0);
+  return mismatch;
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -12,16 +12,16 @@ namespace pd::inline PD_TARGET {
 template <class R>
 struct Outliers {
   bool some;  // whether there are any
-  R trusted;  // Misfit::trusted
+  R trusted;  // MaterialMismatch::trusted
 };
 
-template <class Lanes, bool Touching>
+template <class Lanes, bool HasContacts>
 struct TrialVertex {
   using T = typename Lanes::Scalar;
   using Value = typename Lanes::Value;
   using Real = typename Lanes::Real;
 
-  const Vertex<Lanes, Touching>& vertex;
+  const Vertex<Lanes, HasContacts>& vertex;
   Value iterate, residual;  // of the last accepted trial
   const Mat3<Real>* free;   // ContactProjector::free at the iterate; not read without contacts
   const Levels<T>& levels;
@@ -38,7 +38,7 @@ struct TrialVertex {
   // `direction` from M along the free directions; Jacobi's step, residual / D, across them and at an outlier.
   PD_HD Value completed(const Value& direction) const {
     const Value diagonal = vertex.inverse * residual;
-    if constexpr (!Touching) return at_outlier(diagonal, direction);
+    if constexpr (!HasContacts) return at_outlier(diagonal, direction);
     return at_outlier(diagonal,
                       along_free(direction, free) + (diagonal - along_free(diagonal, free)));
   }
@@ -47,7 +47,7 @@ struct TrialVertex {
   PD_HD Value step(const Contacts<Real>& contacts, const Value& before, const Value& gradient,
                    const Value& direction, const Real& length, const Real& beta) const {
     const Value displacement = completed(length * direction - beta * (iterate - before));
-    return vertex.land(contacts, iterate - displacement, iterate, gradient);
+    return vertex.project_trial(contacts, iterate - displacement, iterate, gradient);
   }
 
   // Next trial of the fallback: a Jacobi iteration; if `accelerates`, relaxed by theta and accelerated by omega.
@@ -64,14 +64,14 @@ struct TrialVertex {
 
  private:
   PD_HD static Value along_free(const Value& field, const Mat3<Real>* along) {
-    if constexpr (!Touching) return field;
+    if constexpr (!HasContacts) return field;
     return Lanes::value(*along * Lanes::vec3(field));
   }
 
   PD_HD Value at_outlier(const Value& there, const Value& elsewhere) const {
     if (!outliers.some) return elsewhere;
     if (!(levels.fine_inverse[number] > T(0))) return there;
-    const Real most = Real(T(known_inertia) * levels.reference_inertia[number]) * outliers.trusted;
+    const Real most = Real(T(outlier_ratio) * levels.reference_inertia[number]) * outliers.trusted;
     return select(vertex.inertia > most, there, elsewhere);
   }
 };

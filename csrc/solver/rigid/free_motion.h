@@ -271,8 +271,8 @@ PD_HD bool starts_still(const double (&sum)[StartSums::count]) {
 }
 
 // Adds a vertex at y = x + u, whose piece would move by `motion`, to these; `near(k, gap)` learns how far from the first planes it
-// would come, and at last from the other contacts. `settled`: after the iterations. Then balls, which curve away from a piece that they
-// hold, count by left_by, in numbers of 0 and less that are no distances.
+// would come, and at last from the other contacts. `settled`: after the iterations. Then spheres, which curve away from a piece that they
+// hold, count by remaining_gap, in numbers of 0 and less that are no distances.
 template <class W, class R, class Near>
 PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
                      const Contacts<R>& contacts, const Vec3<R>& y, const Vec3<R>& u,
@@ -291,7 +291,7 @@ PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
     bounds[Touch::share] =
         lesser(bounds[Touch::share],
                convert<double>(select(after > none, far, select(comes, share, none))));
-    const R reach = -R(scalar_of<R>(lies_within)) * dot(motion.shift, plane.normal);
+    const R reach = -R(scalar_of<R>(contact_tolerance)) * dot(motion.shift, plane.normal);
     const R lies = select(before < reach, one, none);
     const R rubs = select(plane.friction > none, lies, none);
     const Vec3<R> slip = rubs * tangential(u, plane.normal);
@@ -320,7 +320,7 @@ PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
       bounds[3 + n] = lesser(bounds[3 + n], convert<double>(most));
     }
   }
-  near(Touch::planes, contacts.least_left(y, way, told, settled));
+  near(Touch::planes, contacts.least_remaining_gap(y, way, told, settled));
 }
 
 // Of the contacts that a piece does not touch: `touches(k)` says which of the first planes it does.
@@ -329,7 +329,7 @@ PD_HD R least_gap_beside(const Contacts<R>& contacts, const Vec3<R>& y, const Ve
                          bool settled, const Touches& touches) {
   constexpr int most = Touch::planes;
   const int told = contacts.plane_count < most ? contacts.plane_count : most;
-  R least = contacts.least_left(y, way, told, settled);
+  R least = contacts.least_remaining_gap(y, way, told, settled);
   for (int k = 0; k < told; ++k)
     least = lesser(least, select(touches(k), R(HUGE_VAL), gap(contacts.planes[k], y + way)));
   return least;
@@ -386,7 +386,7 @@ constexpr int motion_legs = 4;
 
 // Whether a motion ends at the first of the planes, since the piece is above all that it would touch.
 PD_HD bool comes_to_plane(unsigned touched, const double (&bounds)[Touch::bounds]) {
-  return touched != 0 && touched < Touch::others && bounds[Touch::share] > lies_within;
+  return touched != 0 && touched < Touch::others && bounds[Touch::share] > contact_tolerance;
 }
 
 // The motion that contacts leave to a piece that touches some of them; `plane(k)` are the first of them. From above all of these it

@@ -80,7 +80,7 @@ struct TippingSearch {
       // as a difference, so that what stays where it is keeps its distance to the last bit
       meet(distance, distance + dot(n, way), subtract_product(distance, down, dot(n, normal)));
     }
-    if (contacts.ball_count > 0) {
+    if (contacts.sphere_count > 0) {
       const R distance = contacts.least_gap(y, contacts.plane_count);
       meet(distance, contacts.least_gap(y + way, contacts.plane_count), distance);
     }
@@ -146,7 +146,7 @@ struct Tipping {
     end();
     first = first_of_step;
     const Vec3<double> n = plane.normal;
-    reach = -lies_within * dot(fit.shift, n);
+    reach = -contact_tolerance * dot(fit.shift, n);
     if (fit.hold != Hold::none || !(reach > 0.0) || !(sums[Touch::lying] > 0.0)) return;
     number = plane_number;
     count = round = 0;
