@@ -36,7 +36,7 @@ inline const int32* sizes_view(const Tensor& t, std::int64_t count) {
 
 // Lengths of the arrays, by the names in cpu_plan.def.
 struct PlanRows {
-  std::int64_t size, vertex, group, pin, block, patch_end, slot, shared_end, shared_slot;
+  std::int64_t size, vertex, component, pin, block, patch_end, slot, shared_end, shared_slot;
 };
 
 #define X(name, type, width, rows, meaning) +1
@@ -107,7 +107,7 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.vertices = size[plan_vertices];
   plan.tets = size[plan_tets];
   plan.pins = size[plan_pins];
-  plan.groups = size[plan_groups];
+  plan.components = size[plan_components];
   plan.blocks = size[plan_blocks];
   plan.patches = size[plan_patches];
   plan.slots = size[plan_slots];
@@ -121,7 +121,7 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   PlanRows count{};
   count.size = plan_size_count;
   count.vertex = plan.vertices;
-  count.group = plan.groups;
+  count.component = plan.components;
   count.pin = plan.pins;
   count.block = plan.blocks;
   count.patch_end = plan.patches + 1;

@@ -15,7 +15,7 @@ enum PlanSize : int {
   plan_vertices,
   plan_tets,
   plan_pins,
-  plan_groups,
+  plan_components,
   plan_blocks,
   plan_patches,
   plan_slots,
@@ -70,7 +70,8 @@ struct Plan {
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/cpu_plan.def"
 #undef X
-  int vertices = 0, tets = 0, pins = 0, groups = 0, blocks = 0, patches = 0, slots = 0, shared = 0;
+  int vertices = 0, tets = 0, pins = 0, components = 0, blocks = 0, patches = 0, slots = 0,
+      shared = 0;
   int most_slots = 0;  // of any patch
   Levels<T> levels;
 };

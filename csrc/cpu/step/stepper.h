@@ -82,7 +82,7 @@ class Stepper {
   void align() {
     const bool first = !started_;
     started_ = true;
-    if (plan_.groups == 0 || (first && set_.start() == StartKind::given)) return;
+    if (plan_.components == 0 || (first && set_.start() == StartKind::given)) return;
     if constexpr (HasContacts) {
       if (first && team_.rank == 0)
         begin_still(
@@ -96,9 +96,9 @@ class Stepper {
       team_.barrier();
       goes_on = w_.some_go_on;
       for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-        if (plan_.vertex_group[i] < 0) continue;
+        if (plan_.vertex_component[i] < 0) continue;
         const Vec3<Real> y = Lanes::vec3(w_.x[i] + w_.u[i]);
-        const Vec3<Real> displacement = w_.motion[plan_.vertex_group[i]].of(y);
+        const Vec3<Real> displacement = w_.motion[plan_.vertex_component[i]].of(y);
         w_.u[i] = vertex(i).displaced(w_.u[i], displacement);
         if (first) w_.before[i] = w_.u[i];
       }

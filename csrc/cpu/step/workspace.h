@@ -22,7 +22,7 @@ inline Storage allocate_zeroed(std::size_t bytes) {
 
 // sums of a component with free rigid motions, see solver/rigid/free_motion.h
 template <class Wide>
-struct GroupSums {
+struct ComponentSums {
   Wide start[StartSums::count];
   Wide rigid[RigidSums::count];
   Vec3<Wide> center;
@@ -50,13 +50,13 @@ struct Workspace {
   Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
   Value *origin, *shared_force;                       // [slots]
   Part* parts[2];  // iterations alternate, so that no thread overwrites sums that others read
-  GroupSums<Wide>* group_sums;     // [groups]
-  RigidMotion<Real>* motion;       // [groups]
+  ComponentSums<Wide>* component_sums;  // [components]
+  RigidMotion<Real>* motion;            // [components]
   Real (*touched)[Touch::planes];  // [components] 1 for each of the first planes that it touches
   Real* still;                     // [components] 1 if it starts from its current position
-  Tipping* tipping;                // [groups, environments]
-  bool* goes_on;                   // [groups, environments] moves in this leg, then: in the next
-  TippingSearch<Real>* search;     // [groups]
+  Tipping* tipping;                // [components, environments]
+  bool* goes_on;                // [components, environments] moves in this leg, then: in the next
+  TippingSearch<Real>* search;  // [components]
   Plane<Real>* planes;
   Sphere<Real>* spheres;
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
@@ -97,14 +97,14 @@ struct Workspace {
     place(origin, plan.slots, base);
     place(shared_force, plan.shared ? plan.slots : 0, base);
     for (Part*& array : parts) place(array, part_count, base);
-    place(group_sums, plan.groups, base);
-    place(motion, plan.groups, base);
-    place(touched, plan.groups, base);
-    place(still, plan.groups, base);
-    const int tipping_groups = material.planes_count > 0 ? plan.groups : 0;
-    place(tipping, tipping_groups * Lanes::environments, base);
-    place(search, tipping_groups, base);
-    place(goes_on, plan.groups * Lanes::environments, base);
+    place(component_sums, plan.components, base);
+    place(motion, plan.components, base);
+    place(touched, plan.components, base);
+    place(still, plan.components, base);
+    const int tipping_components = material.planes_count > 0 ? plan.components : 0;
+    place(tipping, tipping_components * Lanes::environments, base);
+    place(search, tipping_components, base);
+    place(goes_on, plan.components * Lanes::environments, base);
     place(planes, material.planes_count, base);
     place(spheres, material.spheres_count, base);
     place(weight,
