@@ -47,7 +47,7 @@ Outputs plain_rollout(const Numbers& n, const Tensor& positions, const Tensor& v
 using Wanted = std::optional<c10::List<bool>>;
 
 // A solved step, for its adjoint; or a rollout, with `after` and `after_velocities` of all its steps.
-struct Taken {
+struct SavedStep {
   Tensor positions, velocities;
   OptionalTensor forces;
   Tensor after, after_velocities;
@@ -55,7 +55,7 @@ struct Taken {
 
 // Gradients for positions, velocities and forces, then for the wanted arrays of the material.
 variable_list call_step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
-                            const Taken& step, at::TensorList material, at::TensorList plan,
+                            const SavedStep& step, at::TensorList material, at::TensorList plan,
                             double time_step, const Wanted& wanted) {
   static const auto op =
       find_op<variable_list(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
@@ -67,7 +67,7 @@ variable_list call_step_vjp(const Tensor& grad_positions, const Tensor& grad_vel
 
 // The same for a rollout, from gradients for all that it recorded.
 variable_list call_rollout_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
-                               const Taken& steps, at::TensorList material, at::TensorList plan,
+                               const SavedStep& steps, at::TensorList material, at::TensorList plan,
                                double time_step, const Wanted& wanted) {
   static const auto op =
       find_op<variable_list(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
@@ -102,13 +102,13 @@ variable_list keep(AutogradContext* context, const Tensor& positions, const Tens
   return {after, after_velocities};
 }
 
-struct Kept {
+struct SavedTensors {
   Tensor positions, velocities;
   OptionalTensor forces;
   Tensor after, after_velocities;
   variable_list material, plan;
 
-  explicit Kept(const variable_list& saved)
+  explicit SavedTensors(const variable_list& saved)
       : positions(saved[0]),
         velocities(saved[1]),
         after(saved[3]),
@@ -150,7 +150,7 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
   }
 
   static variable_list backward(AutogradContext* context, const variable_list& grads) {
-    const Kept kept(context->get_saved_variables());
+    const SavedTensors kept(context->get_saved_variables());
     const bool forces = kept.forces.has_value(), starts = context->saved_data["starts"].toBool();
     const std::size_t start_edge = forces ? 3 : 2;
     TORCH_CHECK(!starts || !context->needs_input_grad(start_edge),
@@ -189,7 +189,7 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
     TORCH_CHECK(!context->saved_data["thins"].toBool(),
                 "torchpd: the rollout op is differentiable with every=1 only, where it records "
                 "every state");
-    const Kept kept(context->get_saved_variables());
+    const SavedTensors kept(context->get_saved_variables());
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
     const variable_list values = call_rollout_vjp(

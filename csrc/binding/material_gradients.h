@@ -25,9 +25,9 @@ inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier)
 }
 
 // Environments that the loss depends on. A NaN environment that the loss leaves out must not spoil shared gradients.
-class Asked {
+class LossMask {
  public:
-  Asked(const Tensor& grad_positions, const Tensor& grad_velocities) {
+  LossMask(const Tensor& grad_positions, const Tensor& grad_velocities) {
     // a single environment shares nothing
     if (grad_positions.size(0) < 2 || grad_positions[0].numel() == 0) return;
     const auto some = [](const Tensor& gradient) { return gradient.ne(0.0).flatten(1).any(1); };
@@ -35,7 +35,7 @@ class Asked {
   }
 
   // [batch, ...], 0 in other environments
-  Tensor only(const Tensor& each) const {
+  Tensor masked(const Tensor& each) const {
     if (!is_.defined()) return each;
     std::vector<std::int64_t> shape(each.dim(), 1);
     shape[0] = -1;
@@ -77,7 +77,7 @@ std::tuple<Tensor, Tensor> gradients_for_contacts_typed(const AdjointTensors& t,
                                                         const Tensor& multiplier,
                                                         const Tensor& elastic, double time_step,
                                                         WantedContacts wanted) {
-  StepTaken<Backend, T> step(t, time_step);
+  SolvedStep<Backend, T> step(t, time_step);
   ContactGradientsCall<T, typename Backend::template Plan<T>> call{step.call};
   call.multiplier = step.keep(multiplier);
   call.elastic = step.keep(elastic);
@@ -110,13 +110,13 @@ class MaterialGradients {
   using Contacts = std::function<std::tuple<Tensor, Tensor>(const Tensor& elastic)>;
   using Sum = Tensor (*)(const Tensor& values);
   MaterialGradients(const AdjointTensors& t, const Tensor& multiplier, const Tensor& elastic,
-                    Contacts contacts, Sum sum, const Asked& asked, double time_step)
+                    Contacts contacts, Sum sum, const LossMask& loss_mask, double time_step)
       : t_(t),
         multiplier_(multiplier),
         elastic_(elastic),
         contacts_(std::move(contacts)),
         sum_(sum),
-        asked_(asked),
+        loss_mask_(loss_mask),
         h_(time_step) {}
 
   // gradient of the array at a place; environments that share it get the sum over them
@@ -132,7 +132,7 @@ class MaterialGradients {
 
  private:
   Tensor reduce(const Tensor& every, const Tensor& like, std::int64_t own) const {
-    const Tensor each = asked_.only(every);
+    const Tensor each = loss_mask_.masked(every);
     return like.dim() == own ? each.sum(0) : each.sum_to_size(like.sizes());
   }
 
@@ -154,7 +154,7 @@ class MaterialGradients {
   }
 
   // the part that held vertices pass on
-  Tensor passed_on() const { return t_.grad_positions + t_.grad_velocities / h_ - product(); }
+  Tensor held_gradient() const { return t_.grad_positions + t_.grad_velocities / h_ - product(); }
 
   Tensor stiffness() const {
     static const auto op =
@@ -184,7 +184,7 @@ class MaterialGradients {
   Tensor pin_targets() const {
     const Tensor held = hard().unsqueeze(-1);
     const Tensor springs = at::where(held, 0.0, material("pin_stiffness").unsqueeze(-1));
-    return at::where(held, pinned(passed_on()), springs * pinned(multiplier_));
+    return at::where(held, pinned(held_gradient()), springs * pinned(multiplier_));
   }
 
   Tensor planes() const { return std::get<0>(of_contacts()); }
@@ -199,7 +199,7 @@ class MaterialGradients {
   const Tensor& elastic_;
   Contacts contacts_;
   Sum sum_;
-  const Asked& asked_;
+  const LossMask& loss_mask_;
   double h_;
   mutable std::optional<std::tuple<Tensor, Tensor>> of_contacts_;
 };

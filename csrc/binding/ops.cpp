@@ -140,7 +140,8 @@ TORCH_LIBRARY(torchpd, m) {
       "Tensor[] plan, *, float time_step, bool[]? wanted=None) -> Tensor[]");
   // its kernel, for every device, comes from Python
   with_plan(
-      "mend_adjoint(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor right, "
+      "adjoint_fallback(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor "
+      "right, "
       "Tensor inverse, "
       "Tensor? projector, Tensor[] material, Tensor[] plan, *, float time_step) -> Tensor");
   with_plan(

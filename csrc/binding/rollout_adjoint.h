@@ -19,7 +19,7 @@ inline std::vector<Tensor> material_at(at::TensorList material, std::int64_t ste
 }
 
 // Gradient for the spheres at the start of the rollout, from the one at a step.
-inline Tensor moved_back(const Tensor& gradient, std::int64_t step) {
+inline Tensor at_rollout_start(const Tensor& gradient, std::int64_t step) {
   const Tensor center = gradient.narrow(-1, spheres_center, 3);
   const Tensor rest = gradient.narrow(-1, 0, spheres_motion);
   return at::cat({rest, gradient.narrow(-1, spheres_motion, 3) + double(step) * center}, -1);
@@ -80,7 +80,7 @@ std::vector<Tensor> rollout_vjp(const Tensor& grad_positions, const Tensor& grad
     grad_v = values[1];
     for (std::size_t i = 0; i < sums.size(); ++i) {
       const Tensor& value = values[i + 2];
-      sums[i] += i == sphere_place && wants(spheres) ? moved_back(value, step) : value;
+      sums[i] += i == sphere_place && wants(spheres) ? at_rollout_start(value, step) : value;
     }
   }
   std::vector<Tensor> found{grad_x, grad_v};

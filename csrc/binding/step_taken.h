@@ -17,12 +17,12 @@ struct AdjointTensors {
 
 // A call's view of a solved step, and the tensors that it points into.
 template <class Backend, class T>
-class StepTaken {
+class SolvedStep {
  public:
   AdjointSystemCall<T, typename Backend::template Plan<T>> call;
   bool touching;
 
-  StepTaken(const AdjointTensors& t, double time_step) {
+  SolvedStep(const AdjointTensors& t, double time_step) {
     const Place place{t.after.device()};
     call.plan = Backend::template plan_view<T>(t.plan, place);
     call.batch = t.after.size(0);
@@ -44,7 +44,7 @@ class StepTaken {
     call.elastic_gradient =
         keep(run_field<Backend>(Field::gradient, t.after.contiguous(), {}, t.material, t.plan));
   }
-  StepTaken(const StepTaken&) = delete;
+  SolvedStep(const SolvedStep&) = delete;
 
   const T* keep(const Tensor& tensor) {
     kept_.push_back(tensor.contiguous());

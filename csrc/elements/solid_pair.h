@@ -41,10 +41,10 @@ PD_HD FaceRest<R, Count> face_rest(const Vec3<R> (&edge)[2 + Count], const R& pe
                                    const R (&per_determinant)[Count]) {
   using T = scalar_of<R>;
   const R least(sizeof(T) == 4 ? T(1) : smallest<T>());
-  const auto no_less = [&](const R& a) { return select(a < least, least, a); };
+  const auto at_least = [&](const R& a) { return select(a < least, least, a); };
   const Vec3<R>&first = edge[0], &second = edge[1];
   const Vec3<R> normal = exact_cross(first, second), ahead = cross(normal, first);
-  const R length2 = no_less(dot(first, first)), normal2 = no_less(dot(normal, normal));
+  const R length2 = at_least(dot(first, first)), normal2 = at_least(dot(normal, normal));
   const R per_length2 = reciprocal(length2), per_normal2 = reciprocal(normal2);
   const R height = rough_square_root(normal2), along = dot(first, second);
   FaceRest<R, Count> rest;
@@ -77,9 +77,9 @@ struct FaceFrame {
   PD_HD FaceFrame(const Vec3<R> (&edge)[2], const R& unit) {
     using T = scalar_of<R>;
     const R least(sizeof(T) == 4 ? T(1) : smallest<T>());
-    const auto no_less = [&](const R& a) { return select(a < least, least, a); };
+    const auto at_least = [&](const R& a) { return select(a < least, least, a); };
     const Vec3<R> normal = exact_cross(edge[0], edge[1]);
-    const R length2 = no_less(dot(edge[0], edge[0])), normal2 = no_less(dot(normal, normal));
+    const R length2 = at_least(dot(edge[0], edge[0])), normal2 = at_least(dot(normal, normal));
     const R per_unit = reciprocal(unit), per_length2 = reciprocal(length2);
     const R per_length = rough_square_root(per_length2), share = unit * per_length;
     height = rough_square_root(normal2);
@@ -196,19 +196,19 @@ PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, 
 // The same for two tetrahedra, with corners loaded when needed and forces stored when known. load(corner, position,
 // rest) gives rest positions in any `unit` [m]; store(corner, force) takes forces. `factor` is unit^2 / det Dm of
 // each. between() runs after the first tetrahedron, where the fewest registers are in use.
-template <bool Energy, class Rest, class R, class Look, class Leave, class Between>
+template <bool Energy, class Rest, class R, class Load, class Store, class Between>
 PD_HD void solid_pair_gradient(const R (&factor)[2], const R (&weight)[2], const R& unit, R& energy,
-                               const Look& look, const Leave& leave, const Between& between) {
+                               const Load& load, const Store& store, const Between& between) {
   Vec3<R> x[3];
   Rest rest[3];
-  for (int c = 0; c < 3; ++c) look(c, x[c], rest[c]);
+  for (int c = 0; c < 3; ++c) load(c, x[c], rest[c]);
   const FaceFrame<R> frame({rest[1] - rest[0], rest[2] - rest[0]}, unit);
   const FaceColumns<R> face({x[1] - x[0], x[2] - x[0]}, frame);
   Vec3<R> first, second, apexes;  // sums over the tetrahedra, for the face's corners
   for (int e = 0; e < 2; ++e) {
     Vec3<R> apex;
     Rest apex_rest;
-    look(3 + e, apex, apex_rest);
+    load(3 + e, apex, apex_rest);
     const Vec3<R> place = apex_rest - rest[0];
     const R h = frame.height * factor[e];
     const R one = dot(frame.one, place), two = dot(frame.two, place);
@@ -225,7 +225,7 @@ PD_HD void solid_pair_gradient(const R (&factor)[2], const R (&weight)[2], const
       for (Vec3<R>& column : stress) column = weight[e] * column;
     }
     const Vec3<R> force = h * stress[2];
-    leave(3 + e, force);
+    store(3 + e, force);
     const Vec3<R> along = subtract_product(stress[0], one, force);
     const Vec3<R> across = subtract_product(stress[1], two, force);
     first = e == 0 ? along : first + along;
@@ -234,9 +234,9 @@ PD_HD void solid_pair_gradient(const R (&factor)[2], const R (&weight)[2], const
     if (e == 0) between();
   }
   const Vec3<R> g1 = multiply_add(frame.q, second, frame.p * first), g2 = frame.r * second;
-  leave(0, -((g1 + g2) + apexes));
-  leave(1, g1);
-  leave(2, g2);
+  store(0, -((g1 + g2) + apexes));
+  store(1, g1);
+  store(2, g2);
 }
 
 }  // namespace pd::inline PD_TARGET

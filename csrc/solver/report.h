@@ -104,12 +104,12 @@ struct ReportVertex {
     const T stiffness = spring(), elastic = call.elastic.of(environment)[vertex];
     const T a = held_inertia(weight(stiffness), stiffness);
     const Vec3<T> x = read(call.positions), u = read(call.displacement);
-    const Vec3<T> shares = read(call.elements), force = read(call.elastic_gradient);
+    const Vec3<T> elements = read(call.elements), force = read(call.elastic_gradient);
     const Vertex<Thread<T>, true> at = {x, target(x, stiffness), a, inverse_diagonal(a, elastic)};
     const Vec3<T> none = {T(0), T(0), T(0)}, twice = at.add_energy(u, none);
-    sum[report_energy] += double(shares.x) + 0.5 * double((twice.x + twice.y) + twice.z);
-    sum[report_inverted] += double(shares.z);
-    sum[report_wrong] += inertia_ratio(a, elastic, at.inverse) < T(0) ? 1 : 0;
+    sum[report_energy] += double(elements.x) + 0.5 * double((twice.x + twice.y) + twice.z);
+    sum[report_inverted] += double(elements.z);
+    sum[report_invalid] += inertia_ratio(a, elastic, at.inverse) < T(0) ? 1 : 0;
     if (!(at.inverse > T(0))) return;
     const MaterialContacts<T> contacts{call.material, environment};
     const Vec3<T> slope = at.gradient(u, force), free = subtract_product(u, at.inverse, slope);
@@ -117,7 +117,7 @@ struct ReportVertex {
     const bool touches = !(dot(pushed, pushed) == T(0));
     sum[report_residual] += square(touches ? at.residual(contacts, u, force) : slope);
     sum[report_force] += square(a * (u - at.target)) + square(force);
-    double rounding = double(shares.y) + double(a) * sqrt(square(u));
+    double rounding = double(elements.y) + double(a) * sqrt(square(u));
     if (touches) rounding += contacts.size(x + u) / double(at.inverse);
     sum[report_rounding] += rounding * rounding;
   }
@@ -129,7 +129,7 @@ PD_HD void write_report(const double (&sum)[report_sums], double* row) {
   const double rounding = report_roundings * double(epsilon<T>()) * sqrt(sum[report_rounding]);
   const double residual = sqrt(sum[report_residual]), force = sqrt(sum[report_force]);
   const double whole = residual > force ? residual : force;
-  const bool known = sum[report_wrong] == 0 && absolute(sum[report_energy]) < HUGE_VAL &&
+  const bool known = sum[report_invalid] == 0 && absolute(sum[report_energy]) < HUGE_VAL &&
                      residual < HUGE_VAL && force < HUGE_VAL && rounding < HUGE_VAL;
   row[info_residual] = !known ? NAN : residual > rounding ? (residual - rounding) / whole : 0;
   row[info_energy] = sum[report_energy];

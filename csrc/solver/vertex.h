@@ -18,8 +18,8 @@ PD_HD R inertia_weight(const R& mass, const R& damping, const R& spring, const R
 // The same, 0 where an infinite spring holds the vertex exactly, and -1 where the spring is negative.
 template <class R>
 PD_HD R held_inertia(const R& inertia, const R& spring) {
-  const R none(0), wrong(-1), most(std::numeric_limits<scalar_of<R>>::max());
-  return select(spring < none, wrong, select(spring > most, none, inertia));
+  const R none(0), invalid(-1), most(std::numeric_limits<scalar_of<R>>::max());
+  return select(spring < none, invalid, select(spring > most, none, inertia));
 }
 
 template <class V, class R>
@@ -39,9 +39,9 @@ PD_HD R inverse_diagonal(const R& inertia, const R& elastic) {
 // a / D of a vertex that moves; infinite where a pin holds it, -1 where mass, spring or stiffness are negative
 template <class R>
 PD_HD R inertia_ratio(const R& inertia, const R& elastic, const R& inverse) {
-  const R none(0), wrong(-1), held(HUGE_VAL);
+  const R none(0), invalid(-1), held(HUGE_VAL);
   const R share = select(inertia > none, inertia * inverse, held);
-  return select(inertia < none, wrong, select(elastic < none, wrong, share));
+  return select(inertia < none, invalid, select(elastic < none, invalid, share));
 }
 
 // x_{k+1} = x_{k-1} + omega (x_k - theta D^-1 grad E - x_{k-1})            (Wang 2015, eq. 16; descent = theta / D)

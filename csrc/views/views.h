@@ -232,7 +232,7 @@ enum ReportSum : int {
   report_force,
   report_rounding,
   report_inverted,
-  report_wrong,
+  report_invalid,
   report_sums
 };
 

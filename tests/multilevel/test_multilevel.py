@@ -67,7 +67,10 @@ def test_lifts_of_a_gpu_have_smoothing_in_them(name: str) -> None:
         below, above = (rng.standard_normal((count, 3)) for count in lift.shape[::-1])
         t = {key: found[f"{kind}_{key}"] for key in ("prolongation_start", "prolongation_node", "prolongation_weight")}
         t |= {key: found[f"{kind}_{key}"] for key in ("node_start", "node_row", "node_weight", "node_prolongation")}
-        rows = bsr_array((t["prolongation_weight"].reshape(-1, height, 4), t["prolongation_node"], t["prolongation_start"]), shape=lift.shape)
+        rows = bsr_array(
+            (t["prolongation_weight"].reshape(-1, height, 4), t["prolongation_node"], t["prolongation_start"]),
+            shape=lift.shape,
+        )
         weight = t["node_weight"].reshape(-1, height, 4).transpose(0, 2, 1)
         nodes = bsr_array((weight, t["node_row"], t["node_start"]), shape=lift.shape[::-1])
         image = lift @ below
