@@ -217,7 +217,7 @@ std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Te
           sliding ? at::maximum(found.error, found.friction) : found.error.contiguous()};
 }
 
-// The solution with the fallback for failed environments, and the warnings: torchpd/adjoint.py.
+// The solution with the fallback for failed environments, and the warnings: torchpd/ops/adjoint.py.
 inline Tensor apply_fallback(const AdjointTensors& t, const AdjointSystem& s, double time_step,
                              const AdjointSolution& found) {
   static const auto op =

@@ -240,8 +240,8 @@ struct Contacts {
     return least;
   }
 
-  // The same after a `displacement`. `settled`: friction may hold the vertex (remaining_gap). A single sphere holds
-  // by friction only what it pushes.
+  // The same after a `displacement`. `settled`: friction may hold the vertex (remaining_gap). A single sphere can
+  // hold by friction only a vertex in contact.
   PD_HD R least_remaining_gap(const Vec3<R>& x, const Vec3<R>& displacement, int first,
                               bool settled) const {
     if (!settled) return least_gap(x + displacement, first);

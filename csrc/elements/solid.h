@@ -165,8 +165,8 @@ struct SolidDiagonal {
   }
 };
 
-// Terms of a report, for each corner of an element: a quarter of the energy [J]; w V |grad N_c|^2 |x|, the
-// force per relative error of positions [N]; a quarter if det F <= 0. Padding has no weight and adds zeros.
+// Terms of a report, for each corner of an element. They are a quarter of the energy [J]; w V |grad N_c|^2 |x|, the
+// force per relative error of positions [N]; and a quarter if det F <= 0. Padding has no weight and adds zeros.
 struct SolidReport {
   static constexpr int strip = 1;
 

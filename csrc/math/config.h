@@ -1,4 +1,4 @@
-// What every physics header needs: the macro for both devices, and the name of the target.
+// Common to every physics header: the macro for both devices, and the name of the target.
 #pragma once
 #include "math/device.h"
 

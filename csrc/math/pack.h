@@ -16,7 +16,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// GCC wants the attribute on a member type, not on a dependent typedef.
+// GCC needs the attribute on a member type, not on a dependent typedef.
 template <class T, int W>
 struct VectorOf {
   using type [[gnu::vector_size(sizeof(T) * W)]] = T;

@@ -2,9 +2,9 @@
 //
 //   (|r| - rounding)+ / max(|f|, |r|),   |f|^2 = sum_i |a_i (u_i - s_i)|^2 + |f_i|^2,
 //
-// where r [N] is the part of grad E that neither pins nor contacts balance, f_i the elastic force on vertex i, and a
-// (u - s) that of inertia, springs and external forces. The two cancel where a step is solved; rounding is what then
-// remains of r. It is a few roundings of every product of stiffness and position:
+// where r [N] is the part of grad E that neither pins nor contacts balance. f_i is the elastic force on vertex i, and
+// a (u - s) the force of inertia, springs, gravity and external forces. The two cancel where a step is solved;
+// rounding is what then remains of r. It is a few roundings of every product of stiffness and position:
 //
 //   rounding = 4 eps sqrt(sum_i (sum_e w V |grad N_i|^2 |x| + a_i |u_i| + [contact force] D_i |n| . |x_i + u_i|)^2).
 //

@@ -76,7 +76,7 @@ struct Plan {
   Levels<T> levels;
 };
 
-// Numbers of a pair of tetrahedra in pair_rest, see device.def.
+// Numbers of a pair of tetrahedra in pair_rest, see gpu_plan.def.
 constexpr int pair_rest_numbers = 12;
 
 // Entries of DevicePlan::sizes, which are members of DevicePlan too.
@@ -300,7 +300,7 @@ struct ContactGradientsCall {
   AdjointSystemCall<T, P> step;   // its outputs are not written
   const T* multiplier = nullptr;  // [batch, vertices, 3] each
   const T* elastic = nullptr;     // elastic Hessian times the multiplier
-  // of every vertex, by the columns of views/material.def; zeros where it touches nothing; null where nobody wants them
+  // for every vertex, by the columns of views/material.def; zeros where it touches nothing; null if not requested
   T* planes = nullptr;   // [batch, vertices, planes, planes_numbers]
   T* spheres = nullptr;  // [batch, vertices, spheres, spheres_numbers]
 };

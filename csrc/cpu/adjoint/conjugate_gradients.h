@@ -341,7 +341,7 @@ class ConjugatePass {
     return call_.projector ? call_.projector + 3 * row(i) : nullptr;
   }
 
-  // `slides`: the multiplier is G^T of what was solved for
+  // `slides`: the multiplier is G^T times the solution
   void store(bool slides) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       if (slides)

@@ -1,4 +1,4 @@
-// L^-T (L^-1 r), symmetric and positive in any precision: the coarse solve of cycle.h. L^-1 is stored row by row up
+// L^-T (L^-1 r), symmetric and positive in any precision: the coarse solve of v_cycle.h. L^-1 is stored row by row up
 // to the diagonal.
 //
 // One environment and several get the same bits. Number j of a row goes to chain j mod 4, and chains are added up

@@ -403,7 +403,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
   bool lbfgs_, corotates_, corotated_ = false;
   Outliers<Real> outliers_{false, Real(T(1))};  // in any lane
   int newest_ = 0, iteration_ = 0;
-  bool has_[width] = {};                        // a small problem
+  bool has_[width] = {};                        // the lane has a coarse problem
   bool holds_[width] = {};                      // includes the contacts at the iterate
   int made_[width] = {}, doubted_[width] = {};  // coarse problems built, and failed trials by then
   Corotation<Lanes> corotation_;

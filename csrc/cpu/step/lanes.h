@@ -1,4 +1,4 @@
-// What runs across SIMD lanes: the elements of one environment (Single), or W environments (Batch).
+// The two layouts of SIMD lanes: the elements of one environment (Single), or W environments (Batch).
 //
 // Both give an environment the same bits: the same operations in the same order, grouped differently.
 #pragma once

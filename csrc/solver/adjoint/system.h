@@ -1,5 +1,5 @@
 // The system of a step's adjoint, H l = dL/dx' + dL/dv' / h on the free directions, and the gradient by the state
-// before the step; see torchpd/adjoint.py. One vertex at a time, without neighbours.
+// before the step; see torchpd/ops/adjoint.py. One vertex at a time, without neighbours.
 #pragma once
 #include "contact/plane_sphere.h"
 #include "math/mat.h"
@@ -72,7 +72,7 @@ struct HeldVertex {
     if (contacts == 1) {
       first_normal = normal;
       first_friction = friction;
-      // it ends where the line from the centre to its start, moved along, meets the sphere
+      // its end is where the line from the centre to its start, moved along, meets the sphere
       const T begins = T(1) - inverse_distance * dot(moved - motion, normal);
       if (sticks && begins > T(0)) carried = T(1) / begins;
       if (friction > T(0) && !sticks)
