@@ -81,9 +81,10 @@ void sum_pieces(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     ComponentSums<Wide>& sums = w.component_sums[g];
     const Wide a = Lanes::widen(w.inertia[i]);
-    const Vec3<Wide> arm = at(i) - sums.center;
-    add_moments(sums.rigid + S::lag, a, arm, widen(Lanes::vec3(w.target[i] - w.u[i])));
-    if (plan.pins > 0) add_pin(sums.rigid + S::pins, a, arm);
+    const Vec3<Wide> lever_arm = at(i) - sums.center;
+    add_moments(sums.rigid + S::target_offset, a, lever_arm,
+                widen(Lanes::vec3(w.target[i] - w.u[i])));
+    if (plan.pins > 0) add_pin(sums.rigid + S::pins, a, lever_arm);
   });
 }
 
