@@ -1,6 +1,6 @@
-// The ops of a step's adjoint on either device. Of a Backend, beside what ops.h asks for: `adjoint_system`,
-// `contact_gradients`, `adjoint_result` and `vertex_sum`, which run a call; and `recording(like)`, whether what is done is recorded for later,
-// where nobody can ask what comes out.
+// The ops of a step's adjoint on either device. Beside the functions of binding/ops.h, a Backend runs a call by
+// `adjoint_system`, `contact_gradients`, `adjoint_result` and `vertex_sum`. `recording(like)` says whether work is
+// only recorded for later, so that its results cannot be read.
 #pragma once
 #include "binding/material_gradients.h"
 
@@ -17,7 +17,7 @@ using AdjointOutputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor
 
 template <class Backend, class T>
 AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
-  StepTaken<Backend, T> step(t, time_step);
+  SolvedStep<Backend, T> step(t, time_step);
   auto& call = step.call;
   const Material<T>& m = call.material;
   const bool own = step.touching || m.stiffness.stride || m.masses.stride || m.damping.stride ||
@@ -44,7 +44,7 @@ AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
   return {right, inertia, inverse, projector, stuck, sliding};
 }
 
-inline void check_step_taken(const AdjointTensors& t, double time_step) {
+inline void check_solved_step(const AdjointTensors& t, double time_step) {
   check_positions(t.positions, "positions");
   check_state(t.velocities, t.positions, "velocities", "m/s");
   check_state(t.after, t.positions, "after", "m");
@@ -54,10 +54,12 @@ inline void check_step_taken(const AdjointTensors& t, double time_step) {
   CheckSetting::time_step(time_step);
 }
 
-// The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1, vertices], and of
-// a scene with contacts the projector off the normals that hold a vertex [batch, vertices, 3, 3], of one that sticks to a ball
-// times how far it goes as its start does, whether friction holds it [batch, vertices], and what it slides along [batch,
-// vertices, 5, 3], else of no environments.
+// The system of a step's adjoint: right side [batch, vertices, 3], inertia and inverse diagonal [batch or 1,
+// vertices]. A scene with contacts adds three arrays; else these have no environments:
+//   projector [batch, vertices, 3, 3]   off the normals that hold a vertex; if it sticks to a sphere, times its motion per
+//                                       motion of its start
+//   stuck [batch, vertices]             whether friction holds it
+//   sliding [batch, vertices, 5, 3]     its vectors of sliding friction, see Slide
 template <class Backend>
 AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_velocities,
                               const Tensor& after, const Tensor& positions,
@@ -65,21 +67,21 @@ AdjointOutputs adjoint_system(const Tensor& grad_positions, const Tensor& grad_v
                               at::TensorList material, at::TensorList plan, double time_step) {
   const AdjointTensors tensors{grad_positions, grad_velocities, after,    positions,
                                velocities,     forces,          material, plan};
-  check_step_taken(tensors, time_step);
+  check_solved_step(tensors, time_step);
   return positions.scalar_type() == at::kFloat
              ? adjoint_system_typed<Backend, float>(tensors, time_step)
              : adjoint_system_typed<Backend, double>(tensors, time_step);
 }
 
-// Of a scene with contacts also what they let through of what vertices that friction holds pass on, dL/dx' + dL/dv' / h - K l.
-struct PassedOn {
+// Only with contacts: the part of dL/dx' + dL/dv' / h - K l that vertices held by friction pass to their start.
+struct HeldTerms {
   OptionalTensor grad_positions, elastic, projector, stuck, sliding;
 };
 
 struct ResultTensors {
   Tensor multiplier, error, grad_velocities;
   at::TensorList material;
-  PassedOn passed_on;
+  HeldTerms held_terms;
 };
 
 template <class Backend, class T>
@@ -103,10 +105,11 @@ Outputs adjoint_result_typed(const ResultTensors& t, double time_step) {
   call.out_velocities = before.mutable_data_ptr<T>();
   call.out_multiplier = out.mutable_data_ptr<T>();
   Tensor grad_x, elastic, projector, stuck, sliding;
-  if (t.passed_on.stuck) {
-    grad_x = t.passed_on.grad_positions->contiguous(), elastic = t.passed_on.elastic->contiguous();
-    projector = t.passed_on.projector->contiguous(), stuck = t.passed_on.stuck->contiguous();
-    sliding = t.passed_on.sliding->contiguous();
+  if (t.held_terms.stuck) {
+    grad_x = t.held_terms.grad_positions->contiguous(),
+    elastic = t.held_terms.elastic->contiguous();
+    projector = t.held_terms.projector->contiguous(), stuck = t.held_terms.stuck->contiguous();
+    sliding = t.held_terms.sliding->contiguous();
     call.grad_positions = grad_x.const_data_ptr<T>();
     call.elastic = elastic.const_data_ptr<T>();
     call.projector = projector.const_data_ptr<T>();
@@ -117,7 +120,7 @@ Outputs adjoint_result_typed(const ResultTensors& t, double time_step) {
   return {x, before, out};
 }
 
-// Gradients for positions and velocities before a step, and the multiplier, of which no number is left where the error is none.
+// Gradients for positions and velocities before a step, and the multiplier. All are NaN where the error is NaN.
 template <class Backend>
 Outputs adjoint_result(const Tensor& multiplier, const Tensor& error, const Tensor& grad_velocities,
                        at::TensorList material, const OptionalTensor& grad_positions,
@@ -165,7 +168,7 @@ std::tuple<Tensor, Tensor> contact_gradients(const Tensor& multiplier, const Ten
                                              at::TensorList plan, double time_step) {
   const AdjointTensors tensors{grad_positions, grad_velocities, after,    positions,
                                velocities,     forces,          material, plan};
-  check_step_taken(tensors, time_step);
+  check_solved_step(tensors, time_step);
   check_state(multiplier, positions, "multiplier", "of a loss, 1/N");
   check_state(elastic, positions, "elastic", "Hessian product, of a loss, 1/m");
   return gradients_for_contacts<Backend>(tensors, multiplier, elastic, time_step);
@@ -176,16 +179,16 @@ struct AdjointSystem {
   OptionalTensor projector, sliding;  // with contacts
 };
 
-// The multiplier, and of every environment the relative residuals of the symmetric system, and of that with friction (solver/
-// friction.h), 0 where nothing slides; the latter undefined without contacts.
-struct Solved {
+// The multiplier, and relative residuals of every environment: of the symmetric system, and of the one with friction
+// (solver/adjoint/friction.h). The latter is 0 where no vertex slides, and undefined without contacts.
+struct AdjointSolution {
   Tensor solution, error, friction;
 };
 
-// By the iterations of conjugate_gradients_ and those of friction, as many as it takes.
+// Iterates conjugate_gradients_, then the friction solve, until all environments have ended.
 template <class Backend>
-Solved iterate(const Tensor& positions, const AdjointSystem& s, at::TensorList material,
-               at::TensorList plan, double tolerance) {
+AdjointSolution iterate(const Tensor& positions, const AdjointSystem& s, at::TensorList material,
+                        at::TensorList plan, double tolerance) {
   const Tensor right = s.right.contiguous(), x = positions.contiguous();
   const Tensor solution = at::empty_like(right), direction = at::empty_like(right);
   const Tensor residual = right.clone();
@@ -208,28 +211,28 @@ std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Te
                                                const OptionalTensor& sliding, double tolerance) {
   check_positions(positions, "positions");
   check_state(right, positions, "right", "N");
-  const Solved found = iterate<Backend>(positions, {right, inertia, inverse, projector, sliding},
-                                        material, plan, tolerance);
+  const AdjointSolution found = iterate<Backend>(
+      positions, {right, inertia, inverse, projector, sliding}, material, plan, tolerance);
   return {found.solution,
           sliding ? at::maximum(found.error, found.friction) : found.error.contiguous()};
 }
 
-// The solution with what stands in where there is none, and the warnings: torchpd/ops/adjoint.py.
-inline Tensor mend(const AdjointTensors& t, const AdjointSystem& s, double time_step,
-                   const Solved& found) {
+// The solution with the fallback for failed environments, and the warnings: torchpd/ops/adjoint.py.
+inline Tensor apply_fallback(const AdjointTensors& t, const AdjointSystem& s, double time_step,
+                             const AdjointSolution& found) {
   static const auto op =
       find_op<Tensor(const Tensor&, const Tensor&, const OptionalTensor&, const Tensor&,
                      const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
-                     at::TensorList, double)>("torchpd::mend_adjoint");
+                     at::TensorList, double)>("torchpd::adjoint_fallback");
   const OptionalTensor friction =
       found.friction.defined() ? OptionalTensor(found.friction) : OptionalTensor();
   return op.call(found.solution, found.error, friction, t.after, s.right, s.inverse, s.projector,
                  t.material, t.plan, time_step);
 }
 
-// Whether a solve of any environment has failed. One copy, which waits for a GPU, and takes less than kernels that make one number
-// of it.
-inline bool some_failed(const Solved& found, double tolerance) {
+// Whether the solve of any environment has failed. One copy waits for a GPU, and takes less time than kernels that
+// reduce it to one number.
+inline bool some_failed(const AdjointSolution& found, double tolerance) {
   const Tensor errors =
       found.friction.defined() ? at::cat({found.error, found.friction}) : found.error;
   const Tensor here = errors.to(at::kCPU).contiguous();
@@ -238,20 +241,20 @@ inline bool some_failed(const Solved& found, double tolerance) {
                      [&](double e) { return e > adjoint_failed * tolerance; });
 }
 
-// The multiplier, and its relative residual of every environment.
+// The multiplier, and its relative residual for every environment.
 template <class Backend>
 std::tuple<Tensor, Tensor> solve(const AdjointTensors& t, const AdjointSystem& s,
                                  double time_step) {
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
-  const Solved found = iterate<Backend>(t.after, s, t.material, t.plan, tolerance);
-  // a recording cannot ask, and does all of it
-  const bool mends = Backend::recording(t.after) || some_failed(found, tolerance);
-  return {mends ? mend(t, s, time_step, found) : found.solution, found.error};
+  const AdjointSolution found = iterate<Backend>(t.after, s, t.material, t.plan, tolerance);
+  // a recording cannot read results, and does all of it
+  const bool falls_back = Backend::recording(t.after) || some_failed(found, tolerance);
+  return {falls_back ? apply_fallback(t, s, time_step, found) : found.solution, found.error};
 }
 
 using Wanted =
-    std::optional<c10::List<bool>>;  // of every array of the material, whether its gradient is
+    std::optional<c10::List<bool>>;  // whether the gradient of each array of the material is wanted
 
 inline void check_wanted(const Wanted& wanted, std::size_t arrays, const char* op) {
   TORCH_CHECK_VALUE(!wanted || wanted->size() == arrays, op, ": wanted must say of each of the ",
@@ -259,8 +262,8 @@ inline void check_wanted(const Wanted& wanted, std::size_t arrays, const char* o
                     wanted ? wanted->size() : 0, " numbers");
 }
 
-// The adjoint of a step: gradients for positions, velocities, forces [batch, vertices, 3], then for the wanted arrays of the
-// material, else all; what nobody wants costs nothing.
+// The adjoint of a step: gradients for positions, velocities and forces [batch, vertices, 3], then for the `wanted`
+// arrays of the material, or all. Gradients that are not wanted cost nothing.
 template <class Backend>
 std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
                              const Tensor& after, const Tensor& positions, const Tensor& velocities,
@@ -282,16 +285,16 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
   const auto [solution, error] =
       solve<Backend>(t, {right, inertia, inverse, free, slips}, time_step);
   Tensor elastic;
-  PassedOn passed_on;
+  HeldTerms held_terms;
   if (touching) {
     elastic = elastic_product(t, solution);
-    passed_on = {grad_positions, elastic, projector, stuck, sliding};
+    held_terms = {grad_positions, elastic, projector, stuck, sliding};
   }
   auto [x, v, multiplier] = adjoint_result<Backend>(
-      solution, error, grad_velocities, material, passed_on.grad_positions, passed_on.elastic,
-      passed_on.projector, passed_on.stuck, passed_on.sliding, time_step);
-  const Asked asked(grad_positions, grad_velocities);
-  std::vector<Tensor> found{asked.only(x), asked.only(v), asked.only(multiplier)};
+      solution, error, grad_velocities, material, held_terms.grad_positions, held_terms.elastic,
+      held_terms.projector, held_terms.stuck, held_terms.sliding, time_step);
+  const LossMask loss_mask(grad_positions, grad_velocities);
+  std::vector<Tensor> found{loss_mask.masked(x), loss_mask.masked(v), loss_mask.masked(multiplier)};
   const MaterialGradients gradients(
       t, multiplier, elastic,
       [&, l = multiplier](const Tensor& product) {
@@ -301,7 +304,7 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
         return gradients_for_contacts<Backend>(t, l, product, time_step,
                                                {wants("planes"), wants("spheres")});
       },
-      &sum_vertices<Backend>, asked, time_step);
+      &sum_vertices<Backend>, loss_mask, time_step);
   for (std::size_t i = 0; i < material.size(); ++i) {
     if (!wanted || wanted->get(i)) found.push_back(gradients.of(i));
   }

@@ -1,6 +1,7 @@
-// What autograd does around a step and a rollout. Their adjoints are ops of their own, step_vjp and rollout_vjp.
+// The autograd functions of a step and a rollout. Their adjoints are ops of their own, step_vjp and rollout_vjp.
 //
-// Not registered from Python, where the lists of a plan and of a material cost more than a small step itself.
+// They are not registered from Python, where the lists of a plan and of a material cost more than a small step
+// itself.
 #include "binding/find_op.h"
 #include "binding/plan_views.h"
 #include "binding/settings.h"
@@ -42,19 +43,19 @@ Outputs plain_rollout(const Numbers& n, const Tensor& positions, const Tensor& v
                        std::move(every));
 }
 
-// Which arrays of a material autograd wants to know about.
+// The arrays of a material that autograd asks for.
 using Wanted = std::optional<c10::List<bool>>;
 
-// A step as it was taken, for its adjoint; or the steps of a rollout, `after` and `after_velocities` being of all of them.
-struct Taken {
+// A solved step, for its adjoint; or a rollout, with `after` and `after_velocities` of all its steps.
+struct SavedStep {
   Tensor positions, velocities;
   OptionalTensor forces;
   Tensor after, after_velocities;
 };
 
-// Gradients for positions, velocities, forces, then for the wanted arrays of the material.
+// Gradients for positions, velocities and forces, then for the wanted arrays of the material.
 variable_list call_step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
-                            const Taken& step, at::TensorList material, at::TensorList plan,
+                            const SavedStep& step, at::TensorList material, at::TensorList plan,
                             double time_step, const Wanted& wanted) {
   static const auto op =
       find_op<variable_list(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
@@ -64,9 +65,9 @@ variable_list call_step_vjp(const Tensor& grad_positions, const Tensor& grad_vel
                  step.positions, step.velocities, step.forces, material, plan, time_step, wanted);
 }
 
-// The same of a rollout, with gradients for all that it recorded.
+// The same for a rollout, from gradients for all that it recorded.
 variable_list call_rollout_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
-                               const Taken& steps, at::TensorList material, at::TensorList plan,
+                               const SavedStep& steps, at::TensorList material, at::TensorList plan,
                                double time_step, const Wanted& wanted) {
   static const auto op =
       find_op<variable_list(const Tensor&, const Tensor&, const Tensor&, const Tensor&,
@@ -77,8 +78,7 @@ variable_list call_rollout_vjp(const Tensor& grad_positions, const Tensor& grad_
                  wanted);
 }
 
-// What autograd does not look at, and both functions have to know; `info` is handed out past it, a report, not a function to
-// differentiate.
+// Arguments without derivatives, which both functions need. `info` is returned past autograd: it is a report.
 struct Unvaried {
   at::TensorList plan;
   Numbers numbers;
@@ -86,8 +86,8 @@ struct Unvaried {
   Tensor* info = nullptr;
 };
 
-// Keeps the inputs that have derivatives, the positions that came out, the velocities `between` steps, and the plan; what there
-// is none of is undefined.
+// Keeps the inputs that have derivatives, the positions that came out, the velocities `between` steps, and the plan;
+// missing ones are undefined.
 variable_list keep(AutogradContext* context, const Tensor& positions, const Tensor& velocities,
                    const OptionalTensor& forces, const Outputs& outputs, const Tensor& between,
                    at::TensorList material, const Unvaried& rest) {
@@ -102,13 +102,13 @@ variable_list keep(AutogradContext* context, const Tensor& positions, const Tens
   return {after, after_velocities};
 }
 
-struct Kept {
+struct SavedTensors {
   Tensor positions, velocities;
   OptionalTensor forces;
   Tensor after, after_velocities;
   variable_list material, plan;
 
-  explicit Kept(const variable_list& saved)
+  explicit SavedTensors(const variable_list& saved)
       : positions(saved[0]),
         velocities(saved[1]),
         after(saved[3]),
@@ -119,7 +119,7 @@ struct Kept {
   }
 };
 
-// Inputs that autograd may ask for, by the order in which a function was given them: state, what else there is, material.
+// Inputs that autograd may ask for, in the order of a function's arguments: state, other inputs, material.
 struct Edges {
   const AutogradContext* context;
   std::size_t first_of_material;
@@ -132,7 +132,7 @@ struct Edges {
   }
 };
 
-// In the places of all arrays, those that were wanted.
+// The wanted gradients at the places of all arrays.
 void append_in_places(variable_list& to, const c10::List<bool>& wanted, const Tensor* values) {
   for (const bool one : wanted) to.push_back(one ? *values++ : Tensor());
 }
@@ -150,7 +150,7 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
   }
 
   static variable_list backward(AutogradContext* context, const variable_list& grads) {
-    const Kept kept(context->get_saved_variables());
+    const SavedTensors kept(context->get_saved_variables());
     const bool forces = kept.forces.has_value(), starts = context->saved_data["starts"].toBool();
     const std::size_t start_edge = forces ? 3 : 2;
     TORCH_CHECK(!starts || !context->needs_input_grad(start_edge),
@@ -167,7 +167,7 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
   }
 };
 
-// A gradient of all steps: what the loss does not depend on takes no memory.
+// A gradient of all steps; one that the loss does not depend on takes no memory.
 Tensor known(const Tensor& gradient, const Tensor& like) {
   return gradient.defined() ? gradient
                             : at::zeros({1}, like.options()).expand_symint(like.sym_sizes());
@@ -189,7 +189,7 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
     TORCH_CHECK(!context->saved_data["thins"].toBool(),
                 "torchpd: the rollout op is differentiable with every=1 only, where it records "
                 "every state");
-    const Kept kept(context->get_saved_variables());
+    const SavedTensors kept(context->get_saved_variables());
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
     const variable_list values = call_rollout_vjp(
@@ -210,7 +210,7 @@ bool varies(at::TensorList tensors) {
   return false;
 }
 
-// Within torch.func.grad and its like torch takes functions from Python alone.
+// Inside torch.func.grad and similar transforms torch accepts only functions from Python.
 void refuse_transforms() {
   const auto& transforms = at::functorch::functorchTLSAccessor();
   if (!transforms) return;
@@ -256,7 +256,7 @@ Outputs rollout(const Numbers& n, const Tensor& positions, const Tensor& velocit
   return {track[0], track[1], info};
 }
 
-// Of an op that has first derivatives only.
+// Marks an op that has first derivatives only.
 class LastDerivative : public torch::autograd::Function<LastDerivative> {
  public:
   static variable_list forward(AutogradContext*, at::TensorList,

@@ -1,4 +1,4 @@
-// Every check of an op's arguments, and nothing else. The arrays of plans and materials: plan_views.h.
+// Every check of an op's arguments, and nothing else. binding/plan_views.h checks the arrays of plans and materials.
 #pragma once
 #include "views/views.h"
 
@@ -18,13 +18,13 @@ inline std::string describe(const Tensor& t) {
   return c10::str(at::toString(t.scalar_type()), " ", t.sizes(), " on ", t.device().str());
 }
 
-// Where the tensors of a call have to be, and the argument that decides it.
+// The place of a call's tensors, and the argument that decides it.
 struct Place {
   at::Device device;
   const char* like = "positions";
 };
 
-// A contiguous tensor of the given type in its place, else an error that says what the argument is.
+// A contiguous tensor of the given type and place, else an error that names the argument.
 inline void check_storage(const Tensor& t, at::ScalarType type, const Place& place,
                           const std::string& name, const char* meaning) {
   TORCH_CHECK_TYPE(t.scalar_type() == type, name, " must be ", at::toString(type), " (", meaning,
@@ -35,7 +35,7 @@ inline void check_storage(const Tensor& t, at::ScalarType type, const Place& pla
                     t.strides(), "; call contiguous()");
 }
 
-// One array of a table, of a plan unless `remedy` says where else it is from: [rows], or [rows, width] when that is more than 1.
+// One array of a table, of a plan unless `remedy` names another source: [rows], or [rows, width] if width > 1.
 inline void check_array(const Tensor& t, at::ScalarType type, std::int64_t rows, std::int64_t width,
                         const Place& place, const std::string& name, const char* meaning,
                         const char* remedy = "compile the scene again") {
@@ -79,7 +79,7 @@ inline void check_vertices(const Tensor& positions, std::int64_t vertices) {
                     " vertices of the plan, got ", describe(positions));
 }
 
-// What step_ overwrites.
+// Checks the tensors that step_ overwrites.
 inline void check_inplace(const Tensor& positions, const Tensor& velocities, const Tensor& info) {
   TORCH_CHECK_VALUE(positions.is_contiguous() && velocities.is_contiguous(),
                     "step_: positions and velocities must be contiguous");
@@ -99,7 +99,7 @@ inline void check_matrices(const Tensor& t, const char* name) {
                     " must be [..., 3, 3], got ", describe(t));
 }
 
-// The direction in which matrices move.
+// The direction of a matrix derivative.
 inline void check_direction(const Tensor& direction, const Tensor& matrices) {
   check_matrices(direction, "direction");
   TORCH_CHECK_VALUE(
@@ -108,7 +108,7 @@ inline void check_direction(const Tensor& direction, const Tensor& matrices) {
       "direction must be ", describe(matrices), " like matrices, got ", describe(direction));
 }
 
-// Of what contacts let through of every vertex.
+// Projector of every vertex on its free directions.
 inline void check_projector(const Tensor& t, const Tensor& like) {
   TORCH_CHECK_TYPE(t.scalar_type() == like.scalar_type(), "projector must be ",
                    at::toString(like.scalar_type()), " like the vectors, got ", describe(t));

@@ -1,4 +1,4 @@
-// The solve of a step's adjoint on either device. Of a Backend: `conjugate`, which runs a call.
+// The solve of a step's adjoint on either device. A Backend runs a call by `conjugate`.
 #pragma once
 #include "binding/checks.h"
 #include "binding/plan_views.h"

@@ -16,7 +16,7 @@
 
 namespace pd {
 
-// K l, by the dispatcher, whose profiler then sees it.
+// K l, through the dispatcher, so that its profiler sees it.
 inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier) {
   static const auto op =
       find_op<Tensor(const Tensor&, const Tensor&, at::TensorList, at::TensorList)>(
@@ -24,18 +24,18 @@ inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier)
   return op.call(t.after, multiplier, t.material, t.plan);
 }
 
-// Environments of whose ends the loss knows anything. One of no number that it leaves out must not spoil what it shares.
-class Asked {
+// Environments that the loss depends on. A NaN environment that the loss leaves out must not spoil shared gradients.
+class LossMask {
  public:
-  Asked(const Tensor& grad_positions, const Tensor& grad_velocities) {
-    // what is alone shares nothing
+  LossMask(const Tensor& grad_positions, const Tensor& grad_velocities) {
+    // a single environment shares nothing
     if (grad_positions.size(0) < 2 || grad_positions[0].numel() == 0) return;
     const auto some = [](const Tensor& gradient) { return gradient.ne(0.0).flatten(1).any(1); };
     is_ = some(grad_positions).logical_or_(some(grad_velocities));
   }
 
-  // [batch, ...], 0 for others
-  Tensor only(const Tensor& each) const {
+  // [batch, ...], 0 in other environments
+  Tensor masked(const Tensor& each) const {
     if (!is_.defined()) return each;
     std::vector<std::int64_t> shape(each.dim(), 1);
     shape[0] = -1;
@@ -46,7 +46,7 @@ class Asked {
   Tensor is_;
 };
 
-// [batch, vertices, ...] to [batch, ...]. Those of torch add up in an order that follows from the batch.
+// Sums [batch, vertices, ...] to [batch, ...]. The order of torch's own sums depends on the batch.
 template <class Backend, class T>
 Tensor sum_vertices_typed(const Tensor& values) {
   const Tensor from = values.contiguous();
@@ -66,18 +66,18 @@ Tensor sum_vertices(const Tensor& values) {
                                             : sum_vertices_typed<Backend, double>(values);
 }
 
-// Whose gradients are wanted, of all contacts.
+// The contacts whose gradients are wanted.
 struct WantedContacts {
   bool planes = true, spheres = true;
 };
 
-// Gradients for planes [batch, planes, 5] and spheres [batch, spheres, 8], of none where nobody wants them; `elastic`: K l.
+// Gradients for planes [batch, planes, 5] and spheres [batch, spheres, 8], empty if not wanted; `elastic`: K l.
 template <class Backend, class T>
 std::tuple<Tensor, Tensor> gradients_for_contacts_typed(const AdjointTensors& t,
                                                         const Tensor& multiplier,
                                                         const Tensor& elastic, double time_step,
                                                         WantedContacts wanted) {
-  StepTaken<Backend, T> step(t, time_step);
+  SolvedStep<Backend, T> step(t, time_step);
   ContactGradientsCall<T, typename Backend::template Plan<T>> call{step.call};
   call.multiplier = step.keep(multiplier);
   call.elastic = step.keep(elastic);
@@ -103,23 +103,23 @@ std::tuple<Tensor, Tensor> gradients_for_contacts(const AdjointTensors& t, const
                                                       t, multiplier, elastic, time_step, wanted);
 }
 
-// -l . dr/dp of every environment, for an array p of the material, from its formulas for all of them.
+// -l . dr/dp of every environment for an array p of the material, from formulas for single environments.
 class MaterialGradients {
  public:
-  // `elastic`: K l, undefined where nobody has worked it out; `contacts`: gradients_for_contacts by K l; `sum`: sum_vertices
+  // `elastic`: K l, or undefined if not computed yet; `contacts`: gradients_for_contacts by K l; `sum`: sum_vertices
   using Contacts = std::function<std::tuple<Tensor, Tensor>(const Tensor& elastic)>;
   using Sum = Tensor (*)(const Tensor& values);
   MaterialGradients(const AdjointTensors& t, const Tensor& multiplier, const Tensor& elastic,
-                    Contacts contacts, Sum sum, const Asked& asked, double time_step)
+                    Contacts contacts, Sum sum, const LossMask& loss_mask, double time_step)
       : t_(t),
         multiplier_(multiplier),
         elastic_(elastic),
         contacts_(std::move(contacts)),
         sum_(sum),
-        asked_(asked),
+        loss_mask_(loss_mask),
         h_(time_step) {}
 
-  // of the array in a place; what environments share has the sum over them
+  // gradient of the array at a place; environments that share it get the sum over them
   Tensor of(std::size_t place) const {
     const Tensor& array = t_.material[place];
 #define X(name, width, rows, meaning)    \
@@ -132,7 +132,7 @@ class MaterialGradients {
 
  private:
   Tensor reduce(const Tensor& every, const Tensor& like, std::int64_t own) const {
-    const Tensor each = asked_.only(every);
+    const Tensor each = loss_mask_.masked(every);
     return like.dim() == own ? each.sum(0) : each.sum_to_size(like.sizes());
   }
 
@@ -148,13 +148,13 @@ class MaterialGradients {
   }
   Tensor pinned(const Tensor& field) const { return field.index_select(1, pins()); }
 
-  // K l; what was worked out before does not know yet that an environment is lost
+  // K l; one computed earlier may lack the NaN of a failed environment
   Tensor product() const {
     return elastic_.defined() ? elastic_ + 0.0 * multiplier_ : elastic_product(t_, multiplier_);
   }
 
-  // what vertices that are held pass on
-  Tensor passed_on() const { return t_.grad_positions + t_.grad_velocities / h_ - product(); }
+  // the part that held vertices pass on
+  Tensor held_gradient() const { return t_.grad_positions + t_.grad_velocities / h_ - product(); }
 
   Tensor stiffness() const {
     static const auto op =
@@ -180,11 +180,11 @@ class MaterialGradients {
     return at::where(hard(), 0.0, -(pinned(multiplier_) * stretch).sum(-1));
   }
 
-  // hard ones take on what their vertices pass on
+  // a hard pin takes the gradient of its vertex
   Tensor pin_targets() const {
     const Tensor held = hard().unsqueeze(-1);
     const Tensor springs = at::where(held, 0.0, material("pin_stiffness").unsqueeze(-1));
-    return at::where(held, pinned(passed_on()), springs * pinned(multiplier_));
+    return at::where(held, pinned(held_gradient()), springs * pinned(multiplier_));
   }
 
   Tensor planes() const { return std::get<0>(of_contacts()); }
@@ -199,7 +199,7 @@ class MaterialGradients {
   const Tensor& elastic_;
   Contacts contacts_;
   Sum sum_;
-  const Asked& asked_;
+  const LossMask& loss_mask_;
   double h_;
   mutable std::optional<std::tuple<Tensor, Tensor>> of_contacts_;
 };

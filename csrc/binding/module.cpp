@@ -1,4 +1,4 @@
-// `torchpd._C`: mesh work on NumPy arrays, the tables, what was built. Loading it also registers the ops.
+// `torchpd._C`: mesh work on NumPy arrays, the tables, and how it was built. Loading it also registers the ops.
 #include "binding/settings.h"
 #include "cpu/dispatch.h"
 #include "cuda/common/launch.h"
@@ -30,7 +30,7 @@ using Doubles = py::array_t<double, py::array::c_style>;
 using Numbers = py::array_t<std::int32_t, py::array::c_style>;
 using Indices = py::array_t<std::int64_t, py::array::c_style>;
 
-// Hands the numbers over to NumPy without a copy.
+// Passes the numbers to NumPy without a copy.
 template <class T>
 py::array_t<T> as_array(std::vector<T>& numbers, py::ssize_t width) {
   auto* owned = new std::vector<T>(std::move(numbers));
@@ -91,7 +91,7 @@ py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_siz
   return arrays;
 }
 
-// What a cluster wants beside: a vertex for every patch, and tetrahedra at every vertex.
+// A cluster's additional requirements: a vertex for every patch, and tetrahedra at every vertex.
 void check_cluster(std::int64_t vertices, const Indices& tets, int patches) {
   const std::int64_t most = std::min<std::int64_t>(vertices, pd::most_cluster_blocks);
   if (patches > most)
@@ -241,7 +241,7 @@ py::dict build_info() {
   return info;
 }
 
-// Memory that the current CUDA device wants for a step, of which the counts are known.
+// Memory that a step needs on the current CUDA device, for a plan of given counts.
 template <class T>
 std::int64_t bytes_of([[maybe_unused]] const pd::DeviceStep<T>& step) {
 #if defined(TORCHPD_CUDA)
@@ -270,7 +270,7 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes, int sc
 
 unsigned long main_thread = 0;
 
-// What Python does between two of its own instructions: handlers of signals run, that of Ctrl-C raises KeyboardInterrupt.
+// Runs pending signal handlers, as Python does between two instructions; that of Ctrl-C raises KeyboardInterrupt.
 // Only the main thread has any.
 void run_signal_handlers() {
   if (PyThread_get_thread_ident() != main_thread) return;
@@ -281,7 +281,7 @@ void run_signal_handlers() {
   if (raised) throw *raised;
 }
 
-// float32 multiply-adds per second that one thread of this processor does
+// float32 multiply-adds per second of one thread of this processor
 double multiply_adds_per_second() {
   float seconds = 0;
   std::int64_t operations = 0;
@@ -297,7 +297,7 @@ PYBIND11_MODULE(_C, m) {
       "torchpd::*.";
   main_thread =
       py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
-  pd::Watch::set_question(&run_signal_handlers);
+  pd::Interrupt::set_check(&run_signal_handlers);
   m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("patch_size"),
         py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
@@ -325,7 +325,7 @@ PYBIND11_MODULE(_C, m) {
   m.attr("info_numbers") = int(pd::info_count);
   m.attr("slide_vectors") = int(pd::slide_count);
   m.def("fused_shared_bytes", &pd::fused_shared_bytes, py::arg("real"), py::arg("many"),
-        py::arg("slots"), py::arg("entries"), py::arg("planes"), py::arg("balls"),
+        py::arg("slots"), py::arg("entries"), py::arg("planes"), py::arg("spheres"),
         "Shared memory of a block of the kernels block and (many patches) grid.");
   m.def(
       "fits_cluster",
@@ -337,7 +337,7 @@ PYBIND11_MODULE(_C, m) {
   m.def("cluster_threads", &pd::cluster_threads, py::arg("real"), py::arg("pairs"),
         py::arg("interior"), "Threads of a block of the kernel cluster.");
   m.def("cluster_shared_bytes", &pd::cluster_shared_bytes, py::arg("real"), py::arg("slots"),
-        py::arg("entries"), py::arg("interior"), py::arg("planes"), py::arg("balls"),
+        py::arg("entries"), py::arg("interior"), py::arg("planes"), py::arg("spheres"),
         "Shared memory of a block of the kernel cluster.");
   m.attr("most_cluster_blocks") = pd::most_cluster_blocks;
   m.def(
@@ -363,7 +363,7 @@ PYBIND11_MODULE(_C, m) {
       "preconditioner.");
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("corotation_bytes") = pd::corotation_bytes;
-  m.attr("known_inertia") = pd::known_inertia;
+  m.attr("outlier_ratio") = pd::outlier_ratio;
   m.attr("adjoint_tolerance") =
       std::make_pair(pd::adjoint_tolerance<float>, pd::adjoint_tolerance<double>);
   m.attr("adjoint_failed") = pd::adjoint_failed;

@@ -1,4 +1,4 @@
-// The ops: schemas, and the CPU behind them.
+// The ops: schemas, and their CPU implementation.
 #include "binding/rollout_adjoint.h"
 
 #include "binding/plan_views.h"
@@ -72,7 +72,7 @@ struct Cpu {
   }
   template <class T>
   static void vertex_sum(const VertexSumCall<T>& call, const Tensor&) {
-    // as many environments for each thread as make waking it worth while
+    // enough environments a thread to make waking it worth while
     const std::int64_t grain =
         at::internal::GRAIN_SIZE / std::max<std::int64_t>(1, call.vertices * call.numbers) + 1;
     at::parallel_for(0, call.batch, grain, [&](std::int64_t begin, std::int64_t end) {
@@ -101,9 +101,9 @@ struct Cpu {
 }  // namespace
 
 TORCH_LIBRARY(torchpd, m) {
-  // A CUDA graph of torch.compile returns what it was given and others want, backward above all,
-  // and can return nothing on the CPU, where every plan has its counts: no op that takes one may be
-  // in such a graph. Ours (capture.py) can hold them.
+  // A CUDA graph of torch.compile returns tensors that it was given and that others need, such as backward. It cannot
+  // return CPU tensors, and every plan has its counts there. So no op that takes a plan may be in such a graph.
+  // Graphs of capture.py may hold them.
   const std::vector<at::Tag> between_graphs{at::Tag::cudagraph_unsafe};
   const auto with_plan = [&](const std::string& schema) { m.def(schema.c_str(), between_graphs); };
   with_plan(
@@ -140,7 +140,8 @@ TORCH_LIBRARY(torchpd, m) {
       "Tensor[] plan, *, float time_step, bool[]? wanted=None) -> Tensor[]");
   // its kernel, for every device, comes from Python
   with_plan(
-      "mend_adjoint(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor right, "
+      "adjoint_fallback(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor "
+      "right, "
       "Tensor inverse, "
       "Tensor? projector, Tensor[] material, Tensor[] plan, *, float time_step) -> Tensor");
   with_plan(

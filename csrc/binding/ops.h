@@ -1,7 +1,8 @@
-// What every op does on either device: checks, views, one call of the backend.
+// Common parts of the ops on either device: checks, views, one call of the backend.
 //
-// A Backend has `Plan<T>`, the plan that its kernels see; `plan_view<T>(arrays, place)`; and `step`, `report`, `field`,
-// `precondition`, `conjugate` and `rotation`, which run a call on the device of the tensor they are given.
+// A Backend has `Plan<T>`, the plan that its kernels read, and `plan_view<T>(arrays, place)`. Its functions `step`,
+// `report`, `field`, `precondition`, `conjugate` and `rotation` run a call on the device of the tensor they are
+// given.
 #pragma once
 #include "binding/checks.h"
 #include "binding/conjugate_ops.h"
@@ -74,11 +75,11 @@ inline Tensor info_for(const Tensor& positions, at::IntArrayRef records) {
   return at::empty(shape, positions.options().dtype(at::kDouble));
 }
 
-// Fills in what a step of one record leaves blank in its rows, see step_report.h.
+// Fills in the fields that a step of one record leaves blank, see binding/step_report.h.
 template <class Backend>
 void report_step(const StepTensors& taken, const Numbers& n);
 
-// The rollout, step by step where they are recorded, with reports, see step_report.h.
+// A rollout with reports, step by step where they are recorded, see binding/step_report.h.
 template <class Backend>
 void report_rollout(const StepTensors& t, const Numbers& n, const Settings& settings);
 
@@ -101,8 +102,9 @@ void step_inplace(const Numbers& n, const Tensor& positions, const Tensor& veloc
                   at::TensorList material, at::TensorList plan) {
   check_positions(positions, "positions");
   check_inplace(positions, velocities, info);
-  // The state is read before it is written: loads and stores of an environment do not overlap in time. Others in the very same place are
-  // safe since blocks wait for each other in iterations: with none, and where they belong to other environments, they are copied.
+  // The state is read before it is written: loads and stores of an environment do not overlap in time. Other inputs
+  // at the very same place are safe, since blocks wait for each other in iterations. They are copied if there are no
+  // iterations, or if they belong to other environments.
   const auto copied = [&](const OptionalTensor& given) {
     if (!given || !(given->is_alias_of(positions) || given->is_alias_of(velocities))) return given;
     const auto is_at = [&](const Tensor& t) {
@@ -111,7 +113,7 @@ void step_inplace(const Numbers& n, const Tensor& positions, const Tensor& veloc
     const bool same = is_at(positions) || is_at(velocities);
     return same && n.iterations > 0 ? given : OptionalTensor(given->clone());
   };
-  // what a report looks back to
+  // the report needs the state before the step
   const auto kept = [&](const Tensor& t) { return n.report ? t.clone() : t; };
   StepTensors tensors{kept(positions), kept(velocities), copied(forces),
                       copied(start),   material,         plan,
@@ -119,7 +121,7 @@ void step_inplace(const Numbers& n, const Tensor& positions, const Tensor& veloc
   if (n.report && tensors.forces) tensors.forces = tensors.forces->clone();
   run_step<Backend>(tensors, settings_of(n, start.has_value(), 1, 1));
   if (n.report) report_step<Backend>(tensors, n);
-  // so that autograd notices when it needs what has been overwritten
+  // so that autograd notices a use of overwritten tensors
   for (const Tensor& t : {positions, velocities, info}) {
     if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
   }

@@ -1,4 +1,4 @@
-// Tensors to views: the arrays of a plan and of a material, and how long they have to be.
+// Tensors to views: the arrays of a plan and of a material, and their lengths.
 #pragma once
 #include "binding/checks.h"
 #include "views/shared_memory.h"
@@ -36,7 +36,7 @@ inline const int32* sizes_view(const Tensor& t, std::int64_t count) {
 
 // Lengths of the arrays, by the names in cpu_plan.def.
 struct PlanRows {
-  std::int64_t size, vertex, group, pin, block, patch_end, slot, shared_end, shared_slot;
+  std::int64_t size, vertex, component, pin, block, patch_end, slot, shared_end, shared_slot;
 };
 
 #define X(name, type, width, rows, meaning) +1
@@ -47,9 +47,10 @@ constexpr int level_arrays = 0
 
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
-  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_lift, host_fine_lift,
-      device_fine_lift, fine_node_end, middle_end, middle_entry, middle, middle_lift,
-      host_middle_lift, device_middle_lift, middle_node_end, coarse_entry, device_coarse_entry;
+  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_prolongation,
+      host_fine_prolongation, device_fine_prolongation, fine_node_end, middle_end, middle_entry,
+      middle, middle_prolongation, host_middle_prolongation, device_middle_prolongation,
+      middle_node_end, coarse_entry, device_coarse_entry;
 };
 
 // The preconditioner's arrays, which begin at `first`.
@@ -68,17 +69,19 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   count.vertex = vertices;
   count.fine_end = vertices + 1;
   count.fine_entry = size[level_fine_entries];
-  count.fine_lift = size[level_fine_lifts];
+  count.fine_prolongation = size[level_fine_prolongations];
   count.fine_node_end = levels.fine_nodes + 1;
   count.middle_end = middle ? levels.fine_nodes + 1 : 0;
   count.middle_entry = size[level_middle_entries];
   count.middle = middle ? levels.fine_nodes : 0;
-  count.middle_lift = size[level_middle_lifts];
+  count.middle_prolongation = size[level_middle_prolongations];
   count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
   count.coarse_entry = coarse * (coarse + 1) / 2;
   const bool on_device = place.device.is_cuda();
-  (on_device ? count.device_fine_lift : count.host_fine_lift) = count.fine_lift;
-  (on_device ? count.device_middle_lift : count.host_middle_lift) = count.middle_lift;
+  (on_device ? count.device_fine_prolongation : count.host_fine_prolongation) =
+      count.fine_prolongation;
+  (on_device ? count.device_middle_prolongation : count.host_middle_prolongation) =
+      count.middle_prolongation;
   count.device_coarse_entry = on_device ? count.coarse_entry : 0;
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = first;
@@ -92,7 +95,7 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   return levels;
 }
 
-// What the arrays hold is trusted; how long they are is not.
+// Lengths of the arrays are checked; their contents are trusted.
 template <class T>
 Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   constexpr int with_levels = plan_arrays + level_arrays;
@@ -104,7 +107,7 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.vertices = size[plan_vertices];
   plan.tets = size[plan_tets];
   plan.pins = size[plan_pins];
-  plan.groups = size[plan_groups];
+  plan.components = size[plan_components];
   plan.blocks = size[plan_blocks];
   plan.patches = size[plan_patches];
   plan.slots = size[plan_slots];
@@ -118,13 +121,13 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   PlanRows count{};
   count.size = plan_size_count;
   count.vertex = plan.vertices;
-  count.group = plan.groups;
+  count.component = plan.components;
   count.pin = plan.pins;
   count.block = plan.blocks;
   count.patch_end = plan.patches + 1;
   count.slot = plan.slots;
   count.shared_end = plan.shared + 1;
-  // every slot that does not hold an interior vertex of its patch holds a shared one
+  // every slot without an interior vertex of its patch holds a shared one
   count.shared_slot = plan.slots - (plan.vertices - plan.shared);
   int at = 0;
   using real = T;
@@ -152,7 +155,7 @@ constexpr int device_plan_arrays = 0
     ;
 #undef X
 
-// Where part_slot stands in the table: how many vertices can move freely is not among the counts.
+// The place of part_slot in the table: the counts lack the number of free vertices.
 #define X(name, type, width, rows, meaning) name,
 enum class DevicePlanArray : int {
 #include "views/gpu_plan.def"
@@ -183,7 +186,7 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
                     "plan.sizes must name a kernel, 0 to 3, and at least one patch, one alone for "
                     "kernel 0, got kernel ",
                     plan.kernel, " and ", plan.patches, " patches; compile the scene again");
-  constexpr int stream = 3;  // of DeviceKernel, which this file does not see
+  constexpr int stream = 3;  // as in DeviceKernel, which this file does not include
   TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || plan.kernel == stream,
                     "plan must be one for kernel 3 (stream) where it has a multilevel "
                     "preconditioner, which no other knows, got kernel ",
@@ -194,8 +197,8 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   TORCH_CHECK_VALUE(plan.blocks <= most_blocks, "plan.sizes must count up to ", most_blocks,
                     " blocks of 32 pairs of tetrahedra, whose corners 32 bits count, got ",
                     plan.blocks, "; compile the scene again, with fewer patches");
-  // every slot that does not hold an interior vertex of its patch holds a shared one, but of a cluster, where all are inside
-  // one patch; pieces and pins may be absent
+  // every slot without an interior vertex of its patch holds a shared one; in a cluster all are inside one patch.
+  // Components and pins may be absent.
   const bool pieces = plan.pieces > 0, cluster = plan.kernel == 1;
   DevicePlanRows count{};
   count.size = size_count;
@@ -267,7 +270,7 @@ constexpr int material_arrays = 0
     ;
 #undef X
 
-// Where an array stands in a material.
+// The place of an array in a material.
 constexpr std::size_t place_in_material(std::string_view name) {
   constexpr std::string_view names[] = {
 #define X(name, width, rows, meaning) #name,

@@ -1,4 +1,4 @@
-// The adjoint of a rollout on either device: backwards through the recorded states, one adjoint of a step after another.
+// The adjoint of a rollout on either device: one step's adjoint after another, backwards through the recorded states.
 #pragma once
 #include "binding/adjoint_ops.h"
 
@@ -18,14 +18,14 @@ inline std::vector<Tensor> material_at(at::TensorList material, std::int64_t ste
   return at_step;
 }
 
-// Of spheres at a step, seen from the start of the rollout.
-inline Tensor moved_back(const Tensor& gradient, std::int64_t step) {
+// Gradient for the spheres at the start of the rollout, from the one at a step.
+inline Tensor at_rollout_start(const Tensor& gradient, std::int64_t step) {
   const Tensor center = gradient.narrow(-1, spheres_center, 3);
   const Tensor rest = gradient.narrow(-1, 0, spheres_motion);
   return at::cat({rest, gradient.narrow(-1, spheres_motion, 3) + double(step) * center}, -1);
 }
 
-// Of every step: [step, batch, vertex, 3], for as many steps as `after` has.
+// Checks a record of every step: [step, batch, vertex, 3], with as many steps as `after` has.
 inline void check_track(const Tensor& t, const Tensor& positions, const Tensor& after,
                         const char* name, const char* meaning) {
   TORCH_CHECK_TYPE(t.scalar_type() == positions.scalar_type(), name, " must be ",
@@ -42,8 +42,8 @@ inline void check_track(const Tensor& t, const Tensor& positions, const Tensor& 
 
 inline Tensor zeros_for(const Tensor& t) { return at::zeros(t.sizes(), t.options()); }
 
-// Gradients for the first positions and velocities, for the forces of all steps, [batch, vertices, 3] each, then for the wanted
-// arrays of the material, else all. `after` and `after_velocities` are what the rollout recorded, every state.
+// Gradients for the first positions and velocities and for the constant forces, [batch, vertices, 3] each; then for
+// the `wanted` arrays of the material, or all. `after` and `after_velocities` are the recorded states, every one.
 template <class Backend>
 std::vector<Tensor> rollout_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
                                 const Tensor& after, const Tensor& after_velocities,
@@ -64,7 +64,7 @@ std::vector<Tensor> rollout_vjp(const Tensor& grad_positions, const Tensor& grad
   const std::size_t spheres = place_in_material("spheres");
   const auto wants = [&](std::size_t i) { return !wanted || wanted->get(i); };
   Tensor grad_x = zeros_for(positions), grad_v = zeros_for(positions);
-  // of forces, then of the wanted arrays
+  // for forces, then for the wanted arrays
   std::vector<Tensor> sums{zeros_for(positions)};
   std::size_t sphere_place = 1;
   for (std::size_t i = 0; i < material.size(); ++i) {
@@ -80,7 +80,7 @@ std::vector<Tensor> rollout_vjp(const Tensor& grad_positions, const Tensor& grad
     grad_v = values[1];
     for (std::size_t i = 0; i < sums.size(); ++i) {
       const Tensor& value = values[i + 2];
-      sums[i] += i == sphere_place && wants(spheres) ? moved_back(value, step) : value;
+      sums[i] += i == sphere_place && wants(spheres) ? at_rollout_start(value, step) : value;
     }
   }
   std::vector<Tensor> found{grad_x, grad_v};

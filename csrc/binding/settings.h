@@ -15,7 +15,7 @@
 
 namespace pd {
 
-// A setting as an op is given it.
+// The type of a setting as an argument of an op.
 template <class Field>
 using Given = std::conditional_t<
     std::is_same_v<Field, double>, double,
@@ -27,7 +27,7 @@ constexpr const char* schema_type = std::is_same_v<Given<Field>, bool>     ? "bo
                                     : std::is_same_v<Given<Field>, double> ? "float"
                                                                            : "int";
 
-// The settings as an op is given them.
+// The settings as arguments of an op.
 struct Numbers {
 #define X(name, type, usual, holds, contract, meaning) Given<type> name;
 #include "views/settings.def"
@@ -42,7 +42,7 @@ inline auto in_order(const Numbers& n) {
   };
 }
 
-// The end of a schema.
+// The settings at the end of a schema.
 inline std::string settings_schema() {
   std::string text;
 #define X(name, type, usual, holds, contract, meaning) \
@@ -52,7 +52,8 @@ inline std::string settings_schema() {
   return text;
 }
 
-// A function of the settings and other arguments as an op, whose settings come last, one by one.
+// Makes an op of a function of the settings and other arguments; the settings are the op's last arguments, one by
+// one.
 template <class Function, class = decltype(in_order({}))>
 struct WithSettings;
 
@@ -72,14 +73,14 @@ struct WithSettings<Result(const Numbers&, Others...), std::tuple<Types...>> {
   }
 };
 
-// What is registered for a function of the settings and other arguments.
+// The registered form of a function of the settings and other arguments.
 template <auto function>
 constexpr auto unpacked =
     &WithSettings<std::remove_pointer_t<decltype(function)>>::template unpacked<function>;
 
 constexpr std::int64_t most_count = 1'000'000'000;
 
-// Each refuses what its setting must not be.
+// Each raises an error for a value that its setting excludes.
 struct CheckSetting {
 #define X(name, type, usual, holds, contract, meaning)                   \
   static void name(Given<type> value) {                                  \

@@ -1,5 +1,5 @@
-// The report of steps that were taken, on either device: passes of their own over the elements and the vertices, whatever kernel
-// the steps ran in. Included by ops.h.
+// The report of solved steps, on either device. Its own passes over elements and vertices serve any kernel. Included
+// by binding/ops.h.
 #pragma once
 #include "binding/ops.h"
 
@@ -17,7 +17,7 @@ void report_typed(const StepTensors& t, const Numbers& n) {
   call.time_step = n.time_step;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
   const Tensor f = t.forces ? t.forces->contiguous() : Tensor();
-  // u, which positions have lost digits of
+  // u; positions alone have lost digits of it
   const Tensor u = t.out_velocities.mul(n.time_step);
   const auto field = [&](Field kind) {
     const Tensor out = at::empty_like(x);
@@ -49,7 +49,8 @@ void report_step(const StepTensors& taken, const Numbers& n) {
   }
 }
 
-// A record's last step alone, since a report needs the state before it. Spheres move on by as many additions as within a call.
+// The last step of a record alone, since a report needs the state before it. Spheres move on by as many additions as
+// in a call.
 template <class Backend>
 void report_rollout(const StepTensors& t, const Numbers& n, const Settings& settings) {
   std::vector<Tensor> material(t.material.begin(), t.material.end());

@@ -1,4 +1,4 @@
-// A step that was taken, as the ops of its adjoint are given it.
+// A solved step, as the ops of its adjoint receive it.
 #pragma once
 #include "binding/ops.h"
 #include "binding/plan_views.h"
@@ -8,21 +8,21 @@
 
 namespace pd {
 
-// A step that was taken, and what a loss wants of its outcome.
+// A solved step, and the loss gradients of its outcome.
 struct AdjointTensors {
   Tensor grad_positions, grad_velocities, after, positions, velocities;
   OptionalTensor forces;
   at::TensorList material, plan;
 };
 
-// What a call asks of a step that was taken, and the tensors that it points into.
+// A call's view of a solved step, and the tensors that it points into.
 template <class Backend, class T>
-class StepTaken {
+class SolvedStep {
  public:
   AdjointSystemCall<T, typename Backend::template Plan<T>> call;
   bool touching;
 
-  StepTaken(const AdjointTensors& t, double time_step) {
+  SolvedStep(const AdjointTensors& t, double time_step) {
     const Place place{t.after.device()};
     call.plan = Backend::template plan_view<T>(t.plan, place);
     call.batch = t.after.size(0);
@@ -44,7 +44,7 @@ class StepTaken {
     call.elastic_gradient =
         keep(run_field<Backend>(Field::gradient, t.after.contiguous(), {}, t.material, t.plan));
   }
-  StepTaken(const StepTaken&) = delete;
+  SolvedStep(const SolvedStep&) = delete;
 
   const T* keep(const Tensor& tensor) {
     kept_.push_back(tensor.contiguous());

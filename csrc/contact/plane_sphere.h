@@ -1,12 +1,12 @@
-// Contact with planes and balls: one vertex, projected after every iteration, with Coulomb friction.
+// Contact of a vertex with planes and spheres by projection after every iteration, with Coulomb friction.
 //
-// The diagonal D is one number a vertex, so Euclidean projection is projection in the metric of the iteration. `depth` is
-// how far the free iterate went in; at the fixed point it is theta omega g_n / D, so that moving the vertex back against its
-// slip by at most friction * depth is Coulomb's law |g_t| <= friction g_n. Friction has no energy: the guard's
-// descent argument covers the normal part alone, and the guard looks less closely where there is friction.
+// The diagonal D is one number a vertex, so Euclidean projection is projection in the metric of the iteration.
+// `depth` is the penetration of the free iterate; at the fixed point it is theta omega g_n / D. Moving the vertex
+// back against its slip by at most friction * depth is then Coulomb's law |g_t| <= friction g_n. Friction has no
+// energy: the guard's descent argument covers the normal part alone, and its slack is larger where there is friction.
 //
-// A ball acts as its tangent plane at the iterate that the step leaves from (`around`): the normal of the free iterate would
-// make the fixed point depend on relaxation and acceleration.
+// A sphere acts as its tangent plane at the iterate that the step leaves from (`around`). The normal at the free
+// iterate would make the fixed point depend on relaxation and acceleration.
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
@@ -15,8 +15,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// A vertex lies on a contact when it is no further off than this share of a way.
-constexpr double lies_within = 0.01;
+// A vertex lies on a contact when its gap is at most this share of the displacement.
+constexpr double contact_tolerance = 0.01;
 
 template <class R>
 struct Plane {
@@ -25,7 +25,7 @@ struct Plane {
 };
 
 template <class R>
-struct Ball {
+struct Sphere {
   Vec3<R> center, motion;
   R radius, friction;
 };
@@ -36,22 +36,22 @@ PD_HD R gap(const Plane<R>& plane, const Vec3<R>& x) {
 }
 
 template <class R>
-PD_HD R gap(const Ball<R>& ball, const Vec3<R>& x) {
-  const Vec3<R> d = x - ball.center;
-  return square_root(dot(d, d)) - ball.radius;
+PD_HD R gap(const Sphere<R>& sphere, const Vec3<R>& x) {
+  const Vec3<R> d = x - sphere.center;
+  return square_root(dot(d, d)) - sphere.radius;
 }
 
-// How far inside; what is no number stays so, and shows.
+// Penetration depth; a NaN stays NaN, so that it shows.
 template <class R>
 PD_HD R penetration(const R& distance) {
   const R none(0);
   return select(distance < none, -distance, select(distance > none, none, distance));
 }
 
-// Away from the ball; upwards for a vertex at its very centre.
+// Outward unit normal of a sphere; the y axis for a vertex at its very centre.
 template <class R>
-PD_HD Vec3<R> outward(const Ball<R>& ball, const Vec3<R>& x) {
-  const Vec3<R> d = x - ball.center;
+PD_HD Vec3<R> outward(const Sphere<R>& sphere, const Vec3<R>& x) {
+  const Vec3<R> d = x - sphere.center;
   const R length = square_root(dot(d, d));
   const auto defined = length > R(0);
   const R scale = R(1) / select(defined, length, R(1));
@@ -63,8 +63,8 @@ PD_HD Vec3<R> tangential(const Vec3<R>& slip, const Vec3<R>& normal) {
   return subtract_product(slip, dot(normal, slip), normal);
 }
 
-// Pushes the displacement `u` out by `depth` along `normal`, then takes back slip against the surface. Most vertices touch nothing,
-// and what is smooth takes nothing back: lane by lane the same, whether others do or not.
+// Moves the displacement `u` out by `depth` along `normal`, then takes back slip against the surface. Both early
+// returns leave every lane the bits that it would have without them.
 template <class R>
 PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, const R& friction,
                        const Vec3<R>& motion) {
@@ -72,88 +72,96 @@ PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, 
   const auto touches = !(depth <= none);
   if (!any(touches)) return u;
   const Vec3<R> pushed = select(touches, multiply_add(depth, normal, u), u);
-  const R rub = friction * depth;
-  const auto rubs = touches && !(rub <= none);
-  if (!any(rubs)) return pushed;
+  const R friction_bound = friction * depth;
+  const auto has_friction = touches && !(friction_bound <= none);
+  if (!any(has_friction)) return pushed;
   const Vec3<R> slip = tangential(pushed - motion, normal);
   const R length = square_root(dot(slip, slip));
-  const R grip = lesser(rub / select(length > none, length, R(1)), R(1));
-  return select(rubs, subtract_product(pushed, grip, slip), pushed);
+  const R friction_scale = lesser(friction_bound / select(length > none, length, R(1)), R(1));
+  return select(has_friction, subtract_product(pushed, friction_scale, slip), pushed);
 }
 
-// How far from a ball a vertex is after `way`; not more than 0 where it lies on it and goes along it, lifted by less than friction * slip:
-// then a force within the cone of friction could be what keeps it from that way.
+// Gap to a sphere after a `displacement`. It is at most 0 where the vertex lies on the sphere and its lift-off is
+// below friction * slip. A force within the friction cone could then prevent that displacement.
 template <class R>
-PD_HD R left_by(const Ball<R>& ball, const R& friction, const Vec3<R>& x, const Vec3<R>& way) {
+PD_HD R remaining_gap(const Sphere<R>& sphere, const R& friction, const Vec3<R>& x,
+                      const Vec3<R>& displacement) {
   using T = scalar_of<R>;
-  const Vec3<R> normal = outward(ball, x);
-  const R across = dot(normal, way), size = square_root(dot(way, way));
+  const Vec3<R> normal = outward(sphere, x);
+  const R across = dot(normal, displacement), size = square_root(dot(displacement, displacement));
   const R rounding =
-      R(4 * std::numeric_limits<T>::epsilon()) * (square_root(dot(x, x)) + ball.radius);
-  const auto lies = !(gap(ball, x) > multiply_add(R(T(lies_within)), size, rounding));
-  const Vec3<R> along = subtract_product(way, across, normal);
+      R(4 * std::numeric_limits<T>::epsilon()) * (square_root(dot(x, x)) + sphere.radius);
+  const auto lies = !(gap(sphere, x) > multiply_add(R(T(contact_tolerance)), size, rounding));
+  const Vec3<R> along = subtract_product(displacement, across, normal);
   const R lift = subtract_product(across, friction, square_root(dot(along, along)));
-  const R after = gap(ball, x + way);
+  const R after = gap(sphere, x + displacement);
   return select(lies, lesser(after, lift), after);
 }
 
-// Of a normal, squared: what earlier ones leave of one that they span but for a thousandth.
-constexpr double spanned = 1e-6;
-// Of a slip: where friction takes back more than that, it resists turning the slip more than the body does.
-constexpr double stiff_grip = 0.1;
+// Squared part of a unit normal that earlier normals do not span; below it the normal counts as dependent.
+constexpr double dependent_normal = 1e-6;
+// Where friction takes back more than this share of a slip, it resists the rotation of the slip more than the body
+// does.
+constexpr double stiff_friction = 0.1;
 
-// A projector without the part `off` that it leaves of a normal, by the reciprocal of that part's square.
+// Removes `off`, the projected part of a normal, from a projector; `reciprocal` is 1 / |off|^2.
 template <class R>
-PD_HD Mat3<R> take_off(const Mat3<R>& free, const Vec3<R>& off, const R& reciprocal) {
+PD_HD Mat3<R> project_off(const Mat3<R>& free, const Vec3<R>& off, const R& reciprocal) {
   return {{subtract_product(free.row[0], reciprocal * off.x, off),
            subtract_product(free.row[1], reciprocal * off.y, off),
            subtract_product(free.row[2], reciprocal * off.z, off)}};
 }
 
-// What contacts leave to a vertex.
+// The directions that contacts leave to a vertex.
 template <class R>
-struct Leeway {
-  Mat3<R> free;   // projector on the directions in which it may go
-  Vec3<R> taken;  // slip that friction takes back
+struct ContactProjector {
+  Mat3<R> free;  // projector on the free directions
+  Vec3<R> slip;  // slip that friction takes back
 };
 
-// A contact that pushes a vertex out by `depth`, if that is more than 0.
+// A contact that moves a vertex out by `depth`, if that is more than 0.
 template <class R>
-struct Push {
+struct Penetration {
   Vec3<R> normal;
   R depth, friction;
   Vec3<R> motion;
 
-  PD_HD Vec3<R> out(const Vec3<R>& u) const { return push_out(u, normal, depth, friction, motion); }
+  PD_HD Vec3<R> push_out(const Vec3<R>& u) const {
+    return pd::push_out(u, normal, depth, friction, motion);
+  }
   PD_HD Vec3<R> slip(const Vec3<R>& u) const { return tangential(u - motion, normal); }
 
-  // Takes from `left` what the contact does that pushes a vertex out from `u`: its normal, and all directions where friction takes
-  // back all slip. Friction resists the turning of a slip as a spring of its force over the slip: where that is stiff only the
-  // direction of the slip is left.
-  PD_HD void take(Leeway<R>& left, const Vec3<R>& u) const {
+  // Removes the directions of this contact from `projector`: its normal, and all directions where friction takes back
+  // all slip. Friction resists the rotation of a slip like a spring of stiffness force / slip. Where that spring is
+  // stiff only the direction of the slip stays free. `u` is the free iterate.
+  PD_HD void remove_from(ContactProjector<R>& projector, const Vec3<R>& u) const {
     const R none(0), one(1);
-    const Vec3<R> way = slip(multiply_add(depth, normal, u));
-    const R length = square_root(dot(way, way)), rub = friction * depth;
+    const Vec3<R> displacement = slip(multiply_add(depth, normal, u));
+    const R length = square_root(dot(displacement, displacement)),
+            friction_bound = friction * depth;
     const R share = one / select(length > none, length, one);
-    left.taken = multiply_add(lesser(one, rub * share), way, left.taken);
-    const Vec3<R> off = left.free * normal;
+    projector.slip =
+        multiply_add(lesser(one, friction_bound * share), displacement, projector.slip);
+    const Vec3<R> off = projector.free * normal;
     const R size = dot(off, off);
-    const auto takes = depth > none && size > R(spanned);
-    left.free = take_off(left.free, off, select(takes, one / select(takes, size, one), none));
-    const Vec3<R> along = left.free * (share * way);
+    const auto takes = depth > none && size > R(dependent_normal);
+    projector.free =
+        project_off(projector.free, off, select(takes, one / select(takes, size, one), none));
+    const Vec3<R> along = projector.free * (share * displacement);
     const R rest = dot(along, along);
-    const auto slides = rest > R(spanned) && !(rub > length);
+    const auto slides = rest > R(dependent_normal) && !(friction_bound > length);
     const R kept = select(slides, one / select(slides, rest, one), none);
-    const auto resists = rub > R(stiff_grip) * length && rub > none;
+    const auto resists = friction_bound > R(stiff_friction) * length && friction_bound > none;
     const R along_row[3] = {kept * along.x, kept * along.y, kept * along.z};
     for (int a = 0; a < 3; ++a) {
-      const Vec3<R> row = left.free.row[a], line = along_row[a] * along;
-      left.free.row[a] = select(resists, line, row);
+      const Vec3<R> row = projector.free.row[a], line = along_row[a] * along;
+      projector.free.row[a] = select(resists, line, row);
     }
   }
 
-  // `next` where friction stops it, if it went back on the slip of a vertex that the contact pushes out from `u`.
-  PD_HD Vec3<R> stop(const Vec3<R>& next, const Vec3<R>& u) const {
+  // `next` without its slip, where that slip is opposite to the slip of the free iterate `u`: friction stops it
+  // there.
+  PD_HD Vec3<R> stop_slip(const Vec3<R>& next, const Vec3<R>& u) const {
     const R none(0);
     const auto stops = friction * depth > none && !(dot(slip(next), slip(u)) > none);
     return subtract_product(next, select(stops, R(1), none), slip(next));
@@ -168,48 +176,49 @@ PD_HD Vec3<R> project(const Plane<R>& plane, const Vec3<R>& x, const Vec3<R>& u,
 }
 
 template <class R>
-PD_HD Vec3<R> project(const Ball<R>& ball, const Vec3<R>& x, const Vec3<R>& u,
+PD_HD Vec3<R> project(const Sphere<R>& sphere, const Vec3<R>& x, const Vec3<R>& u,
                       const Vec3<R>& around) {
-  const Vec3<R> normal = outward(ball, x + around);
-  const R depth = penetration(dot(normal, (x + u) - ball.center) - ball.radius);
-  return push_out(u, normal, depth, ball.friction, ball.motion);
+  const Vec3<R> normal = outward(sphere, x + around);
+  const R depth = penetration(dot(normal, (x + u) - sphere.center) - sphere.radius);
+  return push_out(u, normal, depth, sphere.friction, sphere.motion);
 }
 
 // All contacts of a scene, for one vertex after another.
 template <class R>
 struct Contacts {
   const Plane<R>* planes = nullptr;
-  const Ball<R>* balls = nullptr;
-  int plane_count = 0, ball_count = 0;
+  const Sphere<R>* spheres = nullptr;
+  int plane_count = 0, sphere_count = 0;
 
   PD_HD Vec3<R> project(const Vec3<R>& x, Vec3<R> u, const Vec3<R>& around) const {
     for (int i = 0; i < plane_count; ++i) u = pd::project(planes[i], x, u, around);
-    for (int i = 0; i < ball_count; ++i) u = pd::project(balls[i], x, u, around);
+    for (int i = 0; i < sphere_count; ++i) u = pd::project(spheres[i], x, u, around);
     return u;
   }
 
-  // What the contacts leave to a vertex that they push out from a free iterate `u`.
-  PD_HD Leeway<R> leeway(const Vec3<R>& x, const Vec3<R>& u, const Vec3<R>& around) const {
+  // The free directions of a vertex whose free iterate is `u`.
+  PD_HD ContactProjector<R> contact_projector(const Vec3<R>& x, const Vec3<R>& u,
+                                              const Vec3<R>& around) const {
     const R one(1), none(0);
-    Leeway<R> left = {{{{one, none, none}, {none, one, none}, {none, none, one}}},
-                      {none, none, none}};
-    each(x, u, around, [&](const Push<R>& push, const Vec3<R>& from) {
-      push.take(left, from);
-      return push.out(from);
+    ContactProjector<R> projector = {{{{one, none, none}, {none, one, none}, {none, none, one}}},
+                                     {none, none, none}};
+    each(x, u, around, [&](const Penetration<R>& contact, const Vec3<R>& from) {
+      contact.remove_from(projector, from);
+      return contact.push_out(from);
     });
-    return left;
+    return projector;
   }
 
-  // `next` no further than friction lets slide what the contacts push out from a free iterate `u`, and out of them.
-  PD_HD Vec3<R> land(const Vec3<R>& x, const Vec3<R>& u, const Vec3<R>& around,
-                     const Vec3<R>& next) const {
+  // Projects a trial `next` out of the contacts; slip ends where friction stops it. `u` is the free iterate.
+  PD_HD Vec3<R> project_trial(const Vec3<R>& x, const Vec3<R>& u, const Vec3<R>& around,
+                              const Vec3<R>& next) const {
     Vec3<R> stopped = next;
-    each(x, u, around, [&](const Push<R>& push, const Vec3<R>& from) {
-      stopped = push.stop(stopped, from);
-      return push.out(from);
+    each(x, u, around, [&](const Penetration<R>& contact, const Vec3<R>& from) {
+      stopped = contact.stop_slip(stopped, from);
+      return contact.push_out(from);
     });
-    return each(x, stopped, around, [](const Push<R>& push, const Vec3<R>& at) {
-      return multiply_add(push.depth, push.normal, at);
+    return each(x, stopped, around, [](const Penetration<R>& contact, const Vec3<R>& at) {
+      return multiply_add(contact.depth, contact.normal, at);
     });
   }
 
@@ -217,48 +226,53 @@ struct Contacts {
   PD_HD R friction() const {
     R most(0);
     for (int i = 0; i < plane_count; ++i) most = -lesser(-most, -planes[i].friction);
-    for (int i = 0; i < ball_count; ++i) most = -lesser(-most, -balls[i].friction);
+    for (int i = 0; i < sphere_count; ++i) most = -lesser(-most, -spheres[i].friction);
     return most;
   }
 
-  PD_HD bool has_several() const { return plane_count + ball_count > 1; }
+  PD_HD bool has_multiple() const { return plane_count + sphere_count > 1; }
 
-  // of all balls, and of the planes from the `first` on
+  // The smallest gap to all spheres, and to the planes from `first` on.
   PD_HD R least_gap(const Vec3<R>& x, int first) const {
     R least(HUGE_VAL);
     for (int i = first; i < plane_count; ++i) least = lesser(least, gap(planes[i], x));
-    for (int i = 0; i < ball_count; ++i) least = lesser(least, gap(balls[i], x));
+    for (int i = 0; i < sphere_count; ++i) least = lesser(least, gap(spheres[i], x));
     return least;
   }
 
-  // The same after a `way` from there. `settled`: by left_by. One ball alone holds nothing by friction that it does not push.
-  PD_HD R least_left(const Vec3<R>& x, const Vec3<R>& way, int first, bool settled) const {
-    if (!settled) return least_gap(x + way, first);
+  // The same after a `displacement`. `settled`: friction may hold the vertex (remaining_gap). A single sphere can
+  // hold by friction only a vertex in contact.
+  PD_HD R least_remaining_gap(const Vec3<R>& x, const Vec3<R>& displacement, int first,
+                              bool settled) const {
+    if (!settled) return least_gap(x + displacement, first);
     R least(HUGE_VAL);
-    for (int i = first; i < plane_count; ++i) least = lesser(least, gap(planes[i], x + way));
-    for (int i = 0; i < ball_count; ++i) {
-      const R friction = has_several() ? balls[i].friction : R(0);
-      least = lesser(least, left_by(balls[i], friction, x, way));
+    for (int i = first; i < plane_count; ++i)
+      least = lesser(least, gap(planes[i], x + displacement));
+    for (int i = 0; i < sphere_count; ++i) {
+      const R friction = has_multiple() ? spheres[i].friction : R(0);
+      least = lesser(least, remaining_gap(spheres[i], friction, x, displacement));
     }
     return least;
   }
 
  private:
-  // What visit(contact, u) makes of u, contact after contact. Of one that pushes nothing out it would change the sign of a 0 at most.
+  // Applies visit(contact, u) to u for one contact after another. A contact without penetration could only change the
+  // sign of a zero.
   template <class Visit>
   PD_HD Vec3<R> each(const Vec3<R>& x, Vec3<R> u, const Vec3<R>& around, const Visit& visit) const {
     const R none(0);
-    const auto meet = [&](const Push<R>& push) {
-      if (any(!(push.depth <= none))) u = visit(push, u);
+    const auto apply = [&](const Penetration<R>& contact) {
+      if (any(!(contact.depth <= none))) u = visit(contact, u);
     };
     for (int i = 0; i < plane_count; ++i) {
       const Plane<R>& p = planes[i];
-      meet({p.normal, penetration(gap(p, x + u)), p.friction, {none, none, none}});
+      apply({p.normal, penetration(gap(p, x + u)), p.friction, {none, none, none}});
     }
-    for (int i = 0; i < ball_count; ++i) {
-      const Ball<R>& b = balls[i];
+    for (int i = 0; i < sphere_count; ++i) {
+      const Sphere<R>& b = spheres[i];
       const Vec3<R> normal = outward(b, x + around);
-      meet({normal, penetration(dot(normal, (x + u) - b.center) - b.radius), b.friction, b.motion});
+      apply(
+          {normal, penetration(dot(normal, (x + u) - b.center) - b.radius), b.friction, b.motion});
     }
     return u;
   }

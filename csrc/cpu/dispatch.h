@@ -31,7 +31,7 @@ struct Kernels {
   void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration
 };
 
-// Fastest that the processor supports; the environment variable TORCHPD_SIMD names a slower one, to test it.
+// The fastest instruction set of this processor; the environment variable TORCHPD_SIMD names a slower one for tests.
 const Kernels& kernels();
 
 std::vector<std::string> supported_simd();

@@ -1,4 +1,4 @@
-// What every processor of the architecture has: SSE2 on x86-64, NEON on aarch64.
+// The instructions that every processor of the architecture has: SSE2 on x86-64, NEON on aarch64.
 #include "cpu/system.h"
 
 #define PD_NO_FMA  // x86-64 has it only since AVX2, and a call to the library would be slow

@@ -14,7 +14,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// Leaves the vector registers as code for older instructions expects them; the build keeps the compiler from doing so.
+// Clears the upper vector registers for code compiled for older instructions; the build turns the compiler's own off.
 struct CleanRegisters {
   ~CleanRegisters() {
 #if PD_VECTOR_BYTES >= 32
@@ -26,28 +26,30 @@ struct CleanRegisters {
 // Fewest environments for which lanes run over environments instead of elements.
 constexpr std::int64_t least_batch = 8;
 
-// The stepper that the call's solver needs, with the memory that it alone needs.
-template <class Lanes, bool Touching, class T>
+// The stepper of the call's solver, with its own memory.
+template <class Lanes, bool HasContacts, class T>
 class Runner {
  public:
   Runner(const StepCall<T>& call, int threads) : call_(call) {
-    if (call.settings.multilevel()) outer_.emplace(call, Touching, threads);
+    if (call.settings.multilevel()) multilevel_.emplace(call, HasContacts, threads);
   }
 
-  void roll(Workspace<Lanes>& work, Scratch<Lanes>& scratch, const Team& team, std::int64_t first) {
-    if (outer_) {
-      MultilevelStepper<Lanes, Touching>(call_, work, scratch, team, first, *outer_).roll();
+  void rollout(Workspace<Lanes>& work, Scratch<Lanes>& scratch, const Team& team,
+               std::int64_t first) {
+    if (multilevel_) {
+      MultilevelStepper<Lanes, HasContacts>(call_, work, scratch, team, first, *multilevel_)
+          .rollout();
     } else {
-      Stepper<Lanes, Touching>(call_, work, scratch, team, first).roll();
+      Stepper<Lanes, HasContacts>(call_, work, scratch, team, first).rollout();
     }
   }
 
  private:
   const StepCall<T>& call_;
-  std::optional<OuterWork<Lanes>> outer_;
+  std::optional<MultilevelWork<Lanes>> multilevel_;
 };
 
-template <class Lanes, bool Touching, class T>
+template <class Lanes, bool HasContacts, class T>
 void step_batches(const StepCall<T>& call, int threads) {
   constexpr int W = Lanes::environments;
   const std::int64_t groups = (call.batch + W - 1) / W;
@@ -56,10 +58,10 @@ void step_batches(const StepCall<T>& call, int threads) {
     const CleanRegisters clean;
     Workspace<Lanes> work(call);
     Scratch<Lanes> scratch(call.plan.most_slots);
-    Runner<Lanes, Touching, T> runner(call, 1);
+    Runner<Lanes, HasContacts, T> runner(call, 1);
     const Team alone = team.alone();
     for (std::int64_t g = next++; g < groups && !alone.ended(0); g = next++)
-      runner.roll(work, scratch, alone, g * W);
+      runner.rollout(work, scratch, alone, g * W);
   });
 }
 
@@ -70,40 +72,40 @@ std::vector<Scratch<Lanes>> make_scratches(const Plan<T>& plan, int threads) {
   return scratches;
 }
 
-// One environment after another by the whole team, or each by one thread when its patches are too few to share.
-template <bool Touching, class T>
+// One environment after another by the whole team, or each by one thread when it has too few patches to share.
+template <bool HasContacts, class T>
 void step_singles(const StepCall<T>& call, int threads) {
   using Lanes = Single<T>;
   if (call.batch > 1 && call.plan.patches < 2 * threads)
-    return step_batches<Lanes, Touching>(call, threads);
+    return step_batches<Lanes, HasContacts>(call, threads);
   Workspace<Lanes> work(call);
-  // before the team starts: a member without memory would keep the others waiting
+  // allocated before the team starts: a member without memory would keep the others waiting
   auto scratches = make_scratches<Lanes>(call.plan, threads);
-  Runner<Lanes, Touching, T> runner(call, threads);
+  Runner<Lanes, HasContacts, T> runner(call, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
     const CleanRegisters clean;
     for (std::int64_t e = 0; e < call.batch && !team.ended(0); ++e) {
-      runner.roll(work, scratches[team.rank], team, e);
+      runner.rollout(work, scratches[team.rank], team, e);
       team.barrier();
     }
   });
 }
 
-template <bool Touching, class T>
+template <bool HasContacts, class T>
 void step_with(const StepCall<T>& call, int threads) {
   constexpr int wide = native_width<T>;
   constexpr int narrow = wide > 4 ? wide / 2 : wide;
-  if (call.batch < least_batch) return step_singles<Touching>(call, threads);
+  if (call.batch < least_batch) return step_singles<HasContacts>(call, threads);
   // half the lanes where full ones would leave a thread without work
   const std::int64_t groups = (call.batch + wide - 1) / wide;
-  if (groups >= threads) return step_batches<Batch<T, wide>, Touching>(call, threads);
-  step_batches<Batch<T, narrow>, Touching>(call, threads);
+  if (groups >= threads) return step_batches<Batch<T, wide>, HasContacts>(call, threads);
+  step_batches<Batch<T, narrow>, HasContacts>(call, threads);
 }
 
 template <class T>
 void step_any(const StepCall<T>& call, int threads) {
-  const bool touching = call.material.planes_count + call.material.spheres_count > 0;
-  touching ? step_with<true>(call, threads) : step_with<false>(call, threads);
+  const bool has_contacts = call.material.planes_count + call.material.spheres_count > 0;
+  has_contacts ? step_with<true>(call, threads) : step_with<false>(call, threads);
 }
 
 template <class T>
@@ -118,7 +120,7 @@ void field_any(const FieldCall<T>& call, int threads) {
   });
 }
 
-// Environments side by side where their patches are too few to share.
+// Environments run side by side where they have too few patches to share.
 template <class T>
 void conjugate_any(const ConjugateCall<T>& call, int threads) {
   using Lanes = Single<T>;
@@ -143,7 +145,7 @@ void conjugate_any(const ConjugateCall<T>& call, int threads) {
   });
 }
 
-// M of the fields, environment by environment.
+// Applies M to the fields, environment by environment.
 template <class T>
 void precondition_any(const PreconditionCall<T>& call, int threads) {
   using Lanes = Single<T>;
@@ -211,7 +213,7 @@ void rotation_any(const RotationCall<T>& call, int threads) {
   });
 }
 
-// A loop of independent multiply-adds: the arithmetic this processor can do, to compare speeds across machines.
+// A loop of independent multiply-adds: measures this processor's arithmetic, to compare speeds across machines.
 inline void multiply_add_loop(float* seconds, std::int64_t* operations) {
   constexpr int W = native_width<float>, chains = 12, rounds = 2'000'000;
   Pack<float, W> a[chains];

@@ -1,5 +1,5 @@
-// Every standard header that the kernels use. Included before the instruction set changes, so that none of the inline
-// functions in them is compiled for instructions that the machine may lack.
+// Every standard header that the kernels use. Included before the instruction set changes, so that none of their
+// inline functions is compiled for instructions that the machine may lack.
 #pragma once
 #include <algorithm>
 #include <atomic>

@@ -1,4 +1,4 @@
-// Elastic solid: one tetrahedron keeps its rest shape up to a rotation.
+// Elastic solid: the energy of one tetrahedron is its distance from a rotation.
 //
 //   E = w V / 2 |F - R|^2,   F = Ds Dm^-1,   R = nearest rotation to F       (Vyatkin and Dolgovesov 2023; st = w / 2)
 //   dE/dx_c = w V (F - R) grad N_c,   grad N_c = row c-1 of Dm^-1 for c > 0, minus their sum for c = 0
@@ -58,7 +58,7 @@ PD_HD Mat3<R> strain(const Vec3<R> (&x)[4], const Rest& rest_inverse) {
   return f - nearest_rotation(f);
 }
 
-// Gradient on the four corners of every element, and with `Energy` the energy, where it is `wanted`. Phase by phase over N
+// Gradient on the four corners of every element. With `Energy` and `wanted` also the energy. Each stage runs over N
 // packs of elements, so that their chains of dependent operations overlap.
 template <bool Energy>
 struct SolidGradient {
@@ -112,12 +112,12 @@ PD_HD void solid_hessian_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
   corner_forces(weight * (df - dr), rest_inverse, g);
 }
 
-// The same for many directions at one place, which `turning` holds.
+// The same for many directions at one position, which `jacobian` holds.
 template <class R, class Rest>
-PD_HD void solid_hessian_product(const Turning<R>& turning, const Vec3<R> (&dx)[4],
+PD_HD void solid_hessian_product(const RotationJacobian<R>& jacobian, const Vec3<R> (&dx)[4],
                                  const Rest& rest_inverse, const R& weight, Vec3<R> (&g)[4]) {
   const Mat3<R> df = deformation_gradient(dx, rest_inverse);
-  corner_forces(weight * (df - turning.differential(df)), rest_inverse, g);
+  corner_forces(weight * (df - jacobian.differential(df)), rest_inverse, g);
 }
 
 // Derivative of the energy along `dx`: w V (F - R) : dF
@@ -127,7 +127,7 @@ PD_HD R element_energy_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
   return weight * frobenius(strain(x, rest_inverse), deformation_gradient(dx, rest_inverse));
 }
 
-// The second derivative of every element at field 0, along field 1.
+// Second derivative of every element's energy at field 0, along field 1.
 struct SolidHessian {
   static constexpr int strip = 1;
 
@@ -144,8 +144,8 @@ struct SolidHessian {
   }
 };
 
-// Diagonal of the majoriser on the four corners, l_e w V |grad N_c|^2 in every component, the weight being l_e w V. Minus infinity
-// where that is negative, which no neighbours make up for.
+// Diagonal of the majoriser on the four corners: l_e w V |grad N_c|^2 in every component, from the weight l_e w V. It
+// is minus infinity where that is negative, so that no neighbour can compensate.
 struct SolidDiagonal {
   static constexpr int strip = 1;
 
@@ -165,8 +165,8 @@ struct SolidDiagonal {
   }
 };
 
-// Shares of an element that its four corners add up for a report: a quarter of its energy [J]; w V |grad N_c|^2 |x|, the force
-// that a relative error of positions is multiplied by [N]; and a quarter where det F <= 0. Padding has no weight and counts nothing.
+// Terms of a report, for each corner of an element. They are a quarter of the energy [J]; w V |grad N_c|^2 |x|, the
+// force per relative error of positions [N]; and a quarter if det F <= 0. Padding has no weight and adds zeros.
 struct SolidReport {
   static constexpr int strip = 1;
 

@@ -1,19 +1,19 @@
-// Elastic solids by faces: one tetrahedron, or two that share a face, of corners 0, 1 and 2, with their apexes behind them.
+// Elastic solids by faces: one tetrahedron, or two that share the face of corners 0, 1 and 2, with apexes after them.
 //
-// Their rest shapes stand in a frame of the face, the first axis along the edge from corner 0 to corner 1, the third normal to
-// the face. There Dm^-1 is upper triangular, and all but its last column is the same for both:
+// Rest shapes are given in a frame of the face: the first axis along the edge from corner 0 to corner 1, the third
+// normal to the face. There Dm^-1 is upper triangular, and both tetrahedra share all but its last column:
 //
 //   F = Ds Dm^-1 = [p e_1,  q e_1 + r e_2,  s e_1 + t e_2 + h e_3],   e_c = x_c - x_0,
 //
-// p, q, r of the face, s, t, h of a tetrahedron. With Q the turn into the frame, F Q^T stands here in place of the F of
-// elements/solid.h and R Q^T in place of its R, so energies and forces are the same. What two tetrahedra share is worked out once:
-// that saves a GPU a sixth of the instructions (tools/instructions.py), and a tetrahedron alone a thirtieth.
+// with p, q, r of the face and s, t, h of a tetrahedron. For the rotation Q into the frame, F Q^T replaces the F of
+// elements/solid.h and R Q^T its R, so energies and forces are the same. The shared columns are computed once. That
+// saves a GPU a sixth of the instructions (tools/instructions.py), and a tetrahedron alone a thirtieth.
 #pragma once
 #include "math/rotation.h"
 
 namespace pd::inline PD_TARGET {
 
-// An effect that has a run_face, for one tetrahedron or two.
+// An effect that implements run_face, for one tetrahedron or two.
 template <class Effect>
 concept OnFaces = requires { requires Effect::on_faces; };
 
@@ -22,7 +22,7 @@ struct FaceRest {
   R p, q, r;            // [1/m]
   Vec3<R> apex[Count];  // s, t, h of each tetrahedron [1/m]
 
-  // Dm^-1 of one of them
+  // Dm^-1 of one tetrahedron
   PD_HD Mat3<R> inverse(int which) const {
     const R none(scalar_of<R>(0));
     const Vec3<R>& a = apex[which];
@@ -30,21 +30,21 @@ struct FaceRest {
   }
 };
 
-// That of edges from corner 0 in any unit, `per_unit` of which make a metre, and of unit^2 / det Dm of each tetrahedron. In
-// float32 edges are whole numbers up to 2^31: all squares and their inverses fit, and of a face that collapses in these
-// units everything stays finite.
+// The rest shape from edges that start at corner 0, in any unit: `per_unit` units make a metre, `per_determinant` is
+// unit^2 / det Dm of each tetrahedron. In float32 edges are whole numbers up to 2^31: all squares and their inverses
+// fit, and a face that collapses in these units gives finite numbers.
 //
-// s and t are -h times where the apex stands above the face, in the coordinates of its corners. They are as far off as if the
-// apex were by roundings of itself times |e_1||e_2| / |e_1 x e_2|; h has all its bits, however flat the tetrahedron.
+// s and t are -h times the apex's position above the face, in the coordinates of its corners. Their error equals a
+// few roundings of the apex times |e_1||e_2| / |e_1 x e_2|. h is exact to its bits, however flat the tetrahedron.
 template <class R, int Count>
 PD_HD FaceRest<R, Count> face_rest(const Vec3<R> (&edge)[2 + Count], const R& per_unit,
                                    const R (&per_determinant)[Count]) {
   using T = scalar_of<R>;
   const R least(sizeof(T) == 4 ? T(1) : smallest<T>());
-  const auto no_less = [&](const R& a) { return select(a < least, least, a); };
+  const auto at_least = [&](const R& a) { return select(a < least, least, a); };
   const Vec3<R>&first = edge[0], &second = edge[1];
   const Vec3<R> normal = exact_cross(first, second), ahead = cross(normal, first);
-  const R length2 = no_less(dot(first, first)), normal2 = no_less(dot(normal, normal));
+  const R length2 = at_least(dot(first, first)), normal2 = at_least(dot(normal, normal));
   const R per_length2 = reciprocal(length2), per_normal2 = reciprocal(normal2);
   const R height = rough_square_root(normal2), along = dot(first, second);
   FaceRest<R, Count> rest;
@@ -61,12 +61,12 @@ PD_HD FaceRest<R, Count> face_rest(const Vec3<R> (&edge)[2 + Count], const R& pe
   return rest;
 }
 
-// A face at rest of which the tetrahedra are not known yet: the first two axes of its frame, by which an apex has its place there,
-// a_1, a_2 and 1 / h. Then
+// The frame of a face at rest, before its tetrahedra are known: its first two axes. An apex has the coordinates a_1,
+// a_2 and 1 / h there. Then
 //
 //   f_3 = h ((x_3 - x_0) - a_1 f_1 - a_2 f_2)
 //
-// wants no edges any more but what f_1 and f_2 have of them, which keeps registers free.
+// needs only f_1 and f_2 of the edges, which frees registers.
 template <class R>
 struct FaceFrame {
   R p, q, r;         // [1/m], see above
@@ -77,9 +77,9 @@ struct FaceFrame {
   PD_HD FaceFrame(const Vec3<R> (&edge)[2], const R& unit) {
     using T = scalar_of<R>;
     const R least(sizeof(T) == 4 ? T(1) : smallest<T>());
-    const auto no_less = [&](const R& a) { return select(a < least, least, a); };
+    const auto at_least = [&](const R& a) { return select(a < least, least, a); };
     const Vec3<R> normal = exact_cross(edge[0], edge[1]);
-    const R length2 = no_less(dot(edge[0], edge[0])), normal2 = no_less(dot(normal, normal));
+    const R length2 = at_least(dot(edge[0], edge[0])), normal2 = at_least(dot(normal, normal));
     const R per_unit = reciprocal(unit), per_length2 = reciprocal(length2);
     const R per_length = rough_square_root(per_length2), share = unit * per_length;
     height = rough_square_root(normal2);
@@ -92,7 +92,7 @@ struct FaceFrame {
   }
 };
 
-// The columns that all deformation gradients of a face have, f_1 and f_2, and the third of all their cofactors.
+// The columns f_1 and f_2, which all deformation gradients of a face share, and the third column of their cofactors.
 template <class R>
 struct FaceColumns {
   Vec3<R> first, second, normal;        // normal = f_1 x f_2
@@ -153,8 +153,8 @@ PD_HD void finish_columns(const FaceColumns<R>& face, const Vec3<R>& third, cons
   }
 }
 
-// Gradient on all corners; with `Energy`, where it is `wanted`, strains of weight one, whose halved squares times the weights are
-// added to `energy`. One tetrahedron after the other, which takes the fewest registers.
+// Gradient on all corners. With `Energy` and `wanted` the strains are computed with weight one, and their energies
+// added to `energy`. The tetrahedra are processed one after the other, which takes the fewest registers.
 template <bool Energy, class R, int Count>
 PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, Count>& rest,
                                const R (&weight)[Count], bool wanted, Vec3<R> (&g)[3 + Count],
@@ -167,7 +167,7 @@ PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, 
     third[e] =
         multiply_add(apex.z, x[3 + e] - x[0], multiply_add(apex.y, edge[1], apex.x * edge[0]));
   }
-  Vec3<R> first, second;  // columns of stress of all tetrahedra
+  Vec3<R> first, second;  // summed stress columns of all tetrahedra
   for (int e = 0; e < Count; ++e) {
     const Vec3<R>& apex = rest.apex[e];
     const Invariants<R> i = face.invariants(third[e]);
@@ -193,22 +193,22 @@ PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, 
   g[0] = -((g[1] + g[2]) + g[0]);
 }
 
-// The same of two tetrahedra, whose corners are looked at where they are wanted, and forces left where they are known: look(corner,
-// position, rest) with rest positions in any unit, of so many metres; leave(corner, force). `factor`: unit^2 / det Dm of each.
-// between() comes after the first, where the fewest registers are in use.
-template <bool Energy, class Rest, class R, class Look, class Leave, class Between>
+// The same for two tetrahedra, with corners loaded when needed and forces stored when known. load(corner, position,
+// rest) gives rest positions in any `unit` [m]; store(corner, force) takes forces. `factor` is unit^2 / det Dm of
+// each. between() runs after the first tetrahedron, where the fewest registers are in use.
+template <bool Energy, class Rest, class R, class Load, class Store, class Between>
 PD_HD void solid_pair_gradient(const R (&factor)[2], const R (&weight)[2], const R& unit, R& energy,
-                               const Look& look, const Leave& leave, const Between& between) {
+                               const Load& load, const Store& store, const Between& between) {
   Vec3<R> x[3];
   Rest rest[3];
-  for (int c = 0; c < 3; ++c) look(c, x[c], rest[c]);
+  for (int c = 0; c < 3; ++c) load(c, x[c], rest[c]);
   const FaceFrame<R> frame({rest[1] - rest[0], rest[2] - rest[0]}, unit);
   const FaceColumns<R> face({x[1] - x[0], x[2] - x[0]}, frame);
-  Vec3<R> first, second, apexes;  // what they leave to the corners of the face
+  Vec3<R> first, second, apexes;  // sums over the tetrahedra, for the face's corners
   for (int e = 0; e < 2; ++e) {
     Vec3<R> apex;
     Rest apex_rest;
-    look(3 + e, apex, apex_rest);
+    load(3 + e, apex, apex_rest);
     const Vec3<R> place = apex_rest - rest[0];
     const R h = frame.height * factor[e];
     const R one = dot(frame.one, place), two = dot(frame.two, place);
@@ -225,7 +225,7 @@ PD_HD void solid_pair_gradient(const R (&factor)[2], const R (&weight)[2], const
       for (Vec3<R>& column : stress) column = weight[e] * column;
     }
     const Vec3<R> force = h * stress[2];
-    leave(3 + e, force);
+    store(3 + e, force);
     const Vec3<R> along = subtract_product(stress[0], one, force);
     const Vec3<R> across = subtract_product(stress[1], two, force);
     first = e == 0 ? along : first + along;
@@ -234,9 +234,9 @@ PD_HD void solid_pair_gradient(const R (&factor)[2], const R (&weight)[2], const
     if (e == 0) between();
   }
   const Vec3<R> g1 = multiply_add(frame.q, second, frame.p * first), g2 = frame.r * second;
-  leave(0, -((g1 + g2) + apexes));
-  leave(1, g1);
-  leave(2, g2);
+  store(0, -((g1 + g2) + apexes));
+  store(1, g1);
+  store(2, g2);
 }
 
 }  // namespace pd::inline PD_TARGET

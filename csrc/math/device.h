@@ -3,7 +3,7 @@
 
 #if defined(__CUDACC__)
 #define PD_HD __host__ __device__ __forceinline__
-#define PD_COLD __host__ __device__ __noinline__  // seldom called: keeps its registers to itself
+#define PD_COLD __host__ __device__ __noinline__  // rarely called: keeps its registers to itself
 #define PD_UNROLL _Pragma("unroll")
 #define PD_ROLLED _Pragma("unroll 1")
 #else

@@ -1,7 +1,7 @@
 // W numbers that one instruction handles: a number type for the physics headers.
 //
-// Built on the vector extension of GCC and Clang, so the same source serves AVX-512, AVX2, SSE2 and NEON; intrinsics stand
-// only where the compiler has no operator: square root, reciprocal, gather, "any lane".
+// Built on the vector extension of GCC and Clang, so the same source serves AVX-512, AVX2, SSE2 and NEON. Intrinsics
+// serve where the compiler has no operator: square root, reciprocal, gather, "any lane".
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
@@ -16,13 +16,13 @@
 
 namespace pd::inline PD_TARGET {
 
-// GCC wants the attribute on a member type, not on a dependent typedef.
+// GCC needs the attribute on a member type, not on a dependent typedef.
 template <class T, int W>
 struct VectorOf {
   using type [[gnu::vector_size(sizeof(T) * W)]] = T;
 };
 
-// Which lanes a comparison holds in.
+// The lanes in which a comparison holds.
 template <class T, int W>
 struct Mask {
   using Vector = decltype(typename VectorOf<T, W>::type{} > typename VectorOf<T, W>::type{});
@@ -48,7 +48,7 @@ struct Pack {
     requires(!std::is_same_v<T, double>)
       : Pack(T(a)) {}
 
-  // From any address: aligned data cost the same as with an instruction that insists on it.
+  // Loads from any address: an unaligned load of aligned data costs the same.
   PD_HD static Pack load(const T* from) {
     Pack r;
     std::memcpy(&r.v, from, sizeof(Vector));
@@ -150,7 +150,7 @@ PD_HD Pack<T, W> rough_square_root(Pack<T, W> a) {
   return square_root(a);
 }
 
-// About 14 bits where the hardware has it: enough for a Newton step, which corrects itself.
+// About 14 bits on AVX-512, which suffices for a Newton step: it corrects itself.
 template <class T, int W>
 PD_HD Pack<T, W> rough_reciprocal(Pack<T, W> a) {
   using V [[maybe_unused]] = typename Pack<T, W>::Vector;
@@ -173,7 +173,7 @@ PD_HD Pack<T, W> reciprocal(Pack<T, W> a) {
   return Pack<T, W>(T(1)) / a;
 }
 
-// The lanes in which the fast rotation is not to be trusted, one by one.
+// Recomputes, one by one, the lanes in which the fast rotation is inaccurate.
 template <class T, int W>
 PD_COLD void repair_lanes(const Mat3<Pack<T, W>>& f, Mask<T, W> good, Mat3<Pack<T, W>>& r) {
   for (int lane = 0; lane < W; ++lane) {

@@ -1,11 +1,12 @@
-// The local step of projective dynamics: the rotation nearest to a deformation gradient.
+// The local step of projective dynamics: the rotation nearest to a deformation gradient (polar decomposition).
 //
-// R = argmax over rotations of tr(R^T F). Its value is the largest root of Davenport's quartic (Markley 1993, FOAM)
-//   p(l) = (l^2 - |F|^2)^2 - 8 det(F) l - 4 |cof F|^2,
-// found from above (sqrt(3) |F| >= the sum of the singular values) by Newton's method, then in closed form
+// R = argmax over rotations of tr(R^T F). The maximum is the largest root of Davenport's quartic (Markley 1993, FOAM)
+//   p(l) = (l^2 - |F|^2)^2 - 8 det(F) l - 4 |cof F|^2.
+// Newton's method finds the root from above, since sqrt(3) |F| >= the sum of the singular values. Then in closed form
 //   R = ((k + |F|^2) F - F F^T F + l cof F) / (k l - det F),   k = (l^2 - |F|^2) / 2,
-// because every invariant of F F^T is one of F's. det R = +1, so an inverted element resists. No state, no trigonometry.
-// Where two roots nearly meet (s_2 + s_3 ~ 0 with the sign of det F on s_3) the rotation is ill-defined: SVD.
+// because every invariant of F F^T is one of F's. det R = +1, so an inverted element resists. The method has no state
+// and no trigonometry. The rotation is ill-defined near a double root (s_2 + s_3 ~ 0 with the sign of det F on s_3);
+// there a singular value decomposition replaces the closed form.
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
@@ -38,13 +39,14 @@ PD_HD Root<R> newton(const Invariants<R>& i, const R& l) {
   return {subtract_product(l, R(0.25), change), slope, change};
 }
 
-// Newton's error after a step of relative size t is about 2 t^2: these t, times four, leave it below the rounding.
+// A Newton step of relative size t leaves an error of about 2 t^2. These t, times four, leave it below the rounding.
 template <class T>
 PD_HD constexpr T newton_tolerance() {
   return sizeof(T) == 4 ? T(4e-4) : T(12e-9);
 }
 
-// Two steps serve strains up to 0.11 in float32; lanes that need more go on alone, so that no lane depends on its neighbours.
+// Two steps suffice for strains up to 0.11 in float32. Lanes that need more continue alone, so that no lane depends
+// on its neighbours.
 template <class R>
 PD_HD Root<R> largest_root(const Invariants<R>& i) {
   using T = scalar_of<R>;
@@ -94,7 +96,7 @@ PD_HD Mat3<R> rotation_from_root(const Mat3<R>& f, const Invariants<R>& i, const
   return combine(f, form.diagonal, -form.scale, form.twist);
 }
 
-// The closed form can be trusted while p'(l) is not small against |F|^2 l (4 * 1.8 at rest, 0 at a double root).
+// The closed form is accurate while p'(l) is not small against |F|^2 l (4 * 1.8 at rest, 0 at a double root).
 template <class R>
 PD_HD auto trusted(const Invariants<R>& i, const Root<R>& root) {
   using T = scalar_of<R>;
@@ -102,7 +104,7 @@ PD_HD auto trusted(const Invariants<R>& i, const Root<R>& root) {
          i.norm2 < R(T(1e12));
 }
 
-// Values in and out, so that the hot path may keep F and R in registers.
+// F and R pass by value, so that the hot path may keep them in registers.
 template <class T>
 PD_COLD Mat3<T> safe_rotation(Mat3<T> f) {
   return rotation_by_svd(f);
@@ -111,7 +113,8 @@ PD_COLD Mat3<T> safe_rotation(Mat3<T> f) {
 PD_HD void repair_rotation(const Mat3<float>& f, bool, Mat3<float>& r) { r = safe_rotation(f); }
 PD_HD void repair_rotation(const Mat3<double>& f, bool, Mat3<double>& r) { r = safe_rotation(f); }
 
-// weight (F - R) from the root, checked: fewer operations than by way of R, and below stretches of 2 no larger errors
+// weight (F - R) from the root. This takes fewer operations than forming R, and has no larger errors below stretches
+// of 2.
 template <class R>
 PD_HD Mat3<R> finish_strain(const Mat3<R>& f, const Invariants<R>& i, const Root<R>& root,
                             const R& weight) {
@@ -139,9 +142,9 @@ PD_HD Mat3<R> nearest_rotation(const Mat3<R>& f) {
   return r;
 }
 
-// tr(S) I - S for the symmetric part of S: what a small turn of R meets.
+// tr(S) I - S for the symmetric part of S: the second derivative of tr(R^T F) under a small rotation of R.
 template <class R>
-PD_HD Mat3<R> turn_matrix(const Mat3<R>& s) {
+PD_HD Mat3<R> axis_matrix(const Mat3<R>& s) {
   const R trace = s.row[0].x + s.row[1].y + s.row[2].z;
   const R minus_half(scalar_of<R>(-0.5));
   const R xy = minus_half * (s.row[0].y + s.row[1].x);
@@ -151,10 +154,10 @@ PD_HD Mat3<R> turn_matrix(const Mat3<R>& s) {
       {{trace - s.row[0].x, xy, xz}, {xy, trace - s.row[1].y, yz}, {xz, yz, trace - s.row[2].z}}};
 }
 
-// (tr(S) I - S) x = axis: how a small turn of R answers a torque.
+// Solves (tr(S) I - S) x = axis for the rotation vector x.
 template <class R>
-PD_HD Vec3<R> solve_turn(const Mat3<R>& s, const Vec3<R>& axis) {
-  const Mat3<R> h = turn_matrix(s), c = cofactor(h);
+PD_HD Vec3<R> solve_axis(const Mat3<R>& s, const Vec3<R>& axis) {
+  const Mat3<R> h = axis_matrix(s), c = cofactor(h);
   return (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * (c * axis);
 }
 
@@ -171,32 +174,32 @@ PD_HD Mat3<R> cross_matrix(const Vec3<R>& a) {
 }
 
 // Derivative of the nearest rotation along dF: dR = R [h]_x with (tr(S) I - S) h = axis(R^T dF), S = R^T F symmetric,
-// axis(A) the vector of A - A^T. The map is self-adjoint, so it serves jvp and vjp alike. It is infinite where
-// s_2 + s_3 = 0 (sign of det F on s_3): there the nearest rotation jumps.
+// axis(A) the vector of A - A^T. The map is self-adjoint, so it serves jvp and vjp alike. It is infinite where s_2 +
+// s_3 = 0 (sign of det F on s_3), where the nearest rotation jumps.
 template <class R>
 PD_HD Mat3<R> rotation_differential(const Mat3<R>& f, const Mat3<R>& r, const Mat3<R>& df) {
   const Mat3<R> rt = transpose(r);
-  return r * cross_matrix(solve_turn(rt * f, axis_of(rt * df)));
+  return r * cross_matrix(solve_axis(rt * f, axis_of(rt * df)));
 }
 
-// All that this derivative takes of F, for many directions: R, and the inverse of tr(S) I - S.
+// The part of this derivative that depends on F alone, for many directions: R, and the inverse of tr(S) I - S.
 template <class R>
-struct Turning {
-  Mat3<R> rotation, answer;
+struct RotationJacobian {
+  Mat3<R> rotation, inverse;
 
-  Turning() = default;
+  RotationJacobian() = default;
 
-  PD_HD explicit Turning(const Mat3<R>& f) : rotation(nearest_rotation(f)) {
-    const Mat3<R> h = turn_matrix(transpose(rotation) * f), c = cofactor(h);
-    answer = (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * c;
+  PD_HD explicit RotationJacobian(const Mat3<R>& f) : rotation(nearest_rotation(f)) {
+    const Mat3<R> h = axis_matrix(transpose(rotation) * f), c = cofactor(h);
+    inverse = (R(scalar_of<R>(1)) / dot(h.row[0], c.row[0])) * c;
   }
 
   PD_HD Mat3<R> differential(const Mat3<R>& df) const {
-    return rotation * cross_matrix(answer * axis_of(transpose(rotation) * df));
+    return rotation * cross_matrix(inverse * axis_of(transpose(rotation) * df));
   }
 };
 
-// One Newton step on the group of rotations, then one Newton-Schulz step back onto it: the last bits.
+// One Newton step on the rotation group, then one Newton-Schulz step back onto it: accurate to the last bits.
 template <class R>
 PD_HD Mat3<R> polished_rotation(const Mat3<R>& f) {
   using T = scalar_of<R>;
@@ -204,7 +207,7 @@ PD_HD Mat3<R> polished_rotation(const Mat3<R>& f) {
   const auto good = trusted(i, largest_root(i));
   const Mat3<R> r = nearest_rotation(f);
   const Mat3<R> s = transpose(r) * f;
-  const Mat3<R> turn = cross_matrix(solve_turn(s, axis_of(s)));
+  const Mat3<R> turn = cross_matrix(solve_axis(s, axis_of(s)));
   Mat3<R> turned = r * turn;
   for (int a = 0; a < 3; ++a) turned.row[a] = turned.row[a] + r.row[a];
   const Mat3<R> metric = transpose(turned) * turned;

@@ -1,4 +1,4 @@
-// The few functions that the physics needs of a number, for float and double. Packs bring their own.
+// The functions that the physics headers need of a number, for float and double. Packs bring their own.
 #pragma once
 #include "math/config.h"
 
@@ -11,8 +11,8 @@ PD_HD float square_root(float a) { return sqrtf(a); }
 PD_HD double square_root(double a) { return sqrt(a); }
 PD_HD float absolute(float a) { return fabsf(a); }
 PD_HD double absolute(double a) { return fabs(a); }
-// a b + c, c - a b and a b - c, rounded once where the processor can. Said outright, and the compiler told to fuse nothing by
-// itself, because whether it fuses depends on the surroundings, and the same bits are wanted from every path.
+// a b + c, c - a b and a b - c, rounded once where the processor can. Fusion is explicit, and the compiler must not
+// fuse by itself. Its choice depends on the surroundings, and every path has to produce the same bits.
 #if defined(PD_NO_FMA)
 PD_HD float multiply_add(float a, float b, float c) { return a * b + c; }
 PD_HD double multiply_add(double a, double b, double c) { return a * b + c; }
@@ -25,8 +25,9 @@ PD_HD double subtract_product(double c, double a, double b) { return multiply_ad
 PD_HD float multiply_subtract(float a, float b, float c) { return multiply_add(a, b, -c); }
 PD_HD double multiply_subtract(double a, double b, double c) { return multiply_add(a, b, -c); }
 
-// Of numbers that are neither tiny nor huge, to the last bit or two; the rough ones serve Newton's method, which corrects
-// itself. What a GPU has for them takes such numbers alone: 0 and infinity for those beyond 1e-38 and 1e38.
+// Reciprocals and square roots of numbers that are neither tiny nor huge, to the last bit or two. The rough ones
+// serve Newton's method, which corrects itself. A GPU's instructions flush numbers beyond 1e-38 and 1e38 to 0 and
+// infinity.
 #if defined(__CUDA_ARCH__)
 PD_HD float reciprocal(float a) {
   float r;
@@ -74,7 +75,7 @@ PD_HD constexpr T biggest() {
   return sizeof(T) == 4 ? T(FLT_MAX) : T(DBL_MAX);
 }
 
-// The scalar behind a pack: float for Pack<float, 16>.
+// The scalar type of a pack: float for Pack<float, 16>.
 template <class R>
 struct ScalarOf {
   using type = typename R::scalar;

@@ -1,4 +1,5 @@
-// Signed singular value decomposition of any 3x3 matrix, and with it the nearest rotation: the safe way, for the rare cases.
+// Signed singular value decomposition of any 3x3 matrix, and from it the nearest rotation. Robust and slow: for rare
+// cases.
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
@@ -27,7 +28,7 @@ PD_HD bool orthogonalise(T (&b)[3][3], T (&v)[3][3], int p, int q) {
   return true;
 }
 
-// Exchanges columns p and q when that puts the longer first; the sign keeps det V = +1.
+// Exchanges columns p and q to put the longer one first; the sign keeps det V = +1.
 template <class T>
 PD_HD void order_columns(T (&b)[3][3], T (&v)[3][3], T (&length2)[3], int p, int q) {
   if (!(length2[p] < length2[q])) return;
@@ -55,7 +56,7 @@ PD_HD Vec3<T> carried(const Vec3<T>& u, const Vec3<T>& from, const Vec3<T>& v) {
   return (T(1) / square_root(dot(w, w))) * w;
 }
 
-// F = U diag(s) V^T with det U = det V = +1 and s_0 >= s_1 >= |s_2|: the last carries the sign of det F.
+// F = U diag(s) V^T with det U = det V = +1 and s_0 >= s_1 >= |s_2|: s_2 has the sign of det F.
 template <class T>
 struct SignedSvd {
   Mat3<T> u, v;

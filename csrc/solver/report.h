@@ -1,15 +1,15 @@
-// What a step that was taken says of itself: its energy, how many elements are inverted, and the residual
+// The report of a solved step: its energy, the number of inverted elements, and the residual
 //
 //   (|r| - rounding)+ / max(|f|, |r|),   |f|^2 = sum_i |a_i (u_i - s_i)|^2 + |f_i|^2,
 //
-// r being what neither pins nor contacts balance of grad E [N], f_i the force of the elements on vertex i, and a (u - s) that of
-// inertia, weight, springs and everything else: both cancel where a step is solved. Rounding is what remains of r when they do: a
-// few roundings of every stiffness times position that went into it,
+// where r [N] is the part of grad E that neither pins nor contacts balance. f_i is the elastic force on vertex i, and
+// a (u - s) the force of inertia, springs, gravity and external forces. The two cancel where a step is solved;
+// rounding is what then remains of r. It is a few roundings of every product of stiffness and position:
 //
-//   rounding = 4 eps sqrt(sum_i (sum_e w V |grad N_i|^2 |x| + a_i |u_i| + [a contact pushes] D_i |n| . |x_i + u_i|)^2).
+//   rounding = 4 eps sqrt(sum_i (sum_e w V |grad N_i|^2 |x| + a_i |u_i| + [contact force] D_i |n| . |x_i + u_i|)^2).
 //
-// Without it whatever weighs little beside E x, as the weight of something stiff, or a drift without any force, would read as
-// unsolved; solved steps have been seen to keep up to half of the four.
+// Without this term a body light compared with E x, such as a stiff one under its weight, or a force-free drift,
+// would read as unsolved. Solved steps have shown up to half of the factor four.
 #pragma once
 #include "math/vec.h"
 #include "solver/vertex.h"
@@ -19,7 +19,8 @@ namespace pd::inline PD_TARGET {
 
 constexpr double report_roundings = 4;
 
-// The contacts of an environment, read from its material one after another: `Contacts` for a vertex that meets them once.
+// The contacts of an environment, read from its material one after another: `Contacts` for a single visit of a
+// vertex.
 template <class T>
 struct MaterialContacts {
   const Material<T>& material;
@@ -34,16 +35,16 @@ struct MaterialContacts {
     for (int c = 0; c < material.spheres_count; ++c) {
       const T* p = material.spheres.of(environment) + spheres_numbers * c;
       const T* motion = p + spheres_motion;
-      const Ball<T> ball = {{p[0], p[1], p[2]},
-                            {motion[0], motion[1], motion[2]},
-                            p[spheres_radius],
-                            p[spheres_friction]};
-      u = pd::project(ball, x, u, around);
+      const Sphere<T> sphere = {{p[0], p[1], p[2]},
+                                {motion[0], motion[1], motion[2]},
+                                p[spheres_radius],
+                                p[spheres_friction]};
+      u = pd::project(sphere, x, u, around);
     }
     return u;
   }
 
-  // The largest number that a gap there is the difference of: rounding of it moves what the contact pushes.
+  // The largest number that enters a gap at this position: its rounding changes the contact force.
   PD_HD double size(const Vec3<T>& place) const {
     double most = 0;
     for (int c = 0; c < material.planes_count; ++c) {
@@ -58,7 +59,7 @@ struct MaterialContacts {
   }
 };
 
-// One vertex of one environment, by the user's number; `pin` holds it, or -1.
+// One vertex of one environment, by the user's number; `pin` is the pin that holds it, or -1.
 template <class T, class P>
 struct ReportVertex {
   const ReportCall<T, P>& call;
@@ -79,7 +80,7 @@ struct ReportVertex {
                           T(call.time_step));
   }
 
-  // s, as a step has it
+  // the target s, as a step computes it
   PD_HD Vec3<T> target(const Vec3<T>& x, T stiffness) const {
     Vec3<T> offset = {T(0), T(0), T(0)}, force = offset;
     if (pin >= 0) {
@@ -98,39 +99,39 @@ struct ReportVertex {
     return (x * x + y * y) + z * z;
   }
 
-  // Adds what the vertex has of every ReportSum.
+  // Adds the vertex's terms to every ReportSum.
   PD_HD void add_to(double (&sum)[report_sums]) const {
     const T stiffness = spring(), elastic = call.elastic.of(environment)[vertex];
     const T a = held_inertia(weight(stiffness), stiffness);
     const Vec3<T> x = read(call.positions), u = read(call.displacement);
-    const Vec3<T> shares = read(call.elements), force = read(call.elastic_gradient);
+    const Vec3<T> elements = read(call.elements), force = read(call.elastic_gradient);
     const Vertex<Thread<T>, true> at = {x, target(x, stiffness), a, inverse_diagonal(a, elastic)};
     const Vec3<T> none = {T(0), T(0), T(0)}, twice = at.add_energy(u, none);
-    sum[report_energy] += double(shares.x) + 0.5 * double((twice.x + twice.y) + twice.z);
-    sum[report_inverted] += double(shares.z);
-    sum[report_wrong] += share_of_inertia(a, elastic, at.inverse) < T(0) ? 1 : 0;
+    sum[report_energy] += double(elements.x) + 0.5 * double((twice.x + twice.y) + twice.z);
+    sum[report_inverted] += double(elements.z);
+    sum[report_invalid] += inertia_ratio(a, elastic, at.inverse) < T(0) ? 1 : 0;
     if (!(at.inverse > T(0))) return;
     const MaterialContacts<T> contacts{call.material, environment};
     const Vec3<T> slope = at.gradient(u, force), free = subtract_product(u, at.inverse, slope);
     const Vec3<T> pushed = contacts.project(x, free, u) - free;
     const bool touches = !(dot(pushed, pushed) == T(0));
-    sum[report_unbalanced] += square(touches ? at.unbalanced(contacts, u, force) : slope);
+    sum[report_residual] += square(touches ? at.residual(contacts, u, force) : slope);
     sum[report_force] += square(a * (u - at.target)) + square(force);
-    double rounding = double(shares.y) + double(a) * sqrt(square(u));
+    double rounding = double(elements.y) + double(a) * sqrt(square(u));
     if (touches) rounding += contacts.size(x + u) / double(at.inverse);
     sum[report_rounding] += rounding * rounding;
   }
 };
 
-// What the sums of an environment come to, into its row; NaN where material or state are no numbers, or negative.
+// Writes a row of the report from an environment's sums; NaN where material or state are NaN, infinite or negative.
 template <class T>
 PD_HD void write_report(const double (&sum)[report_sums], double* row) {
   const double rounding = report_roundings * double(epsilon<T>()) * sqrt(sum[report_rounding]);
-  const double left = sqrt(sum[report_unbalanced]), force = sqrt(sum[report_force]);
-  const double whole = left > force ? left : force;
-  const bool known = sum[report_wrong] == 0 && absolute(sum[report_energy]) < HUGE_VAL &&
-                     left < HUGE_VAL && force < HUGE_VAL && rounding < HUGE_VAL;
-  row[info_residual] = !known ? NAN : left > rounding ? (left - rounding) / whole : 0;
+  const double residual = sqrt(sum[report_residual]), force = sqrt(sum[report_force]);
+  const double whole = residual > force ? residual : force;
+  const bool known = sum[report_invalid] == 0 && absolute(sum[report_energy]) < HUGE_VAL &&
+                     residual < HUGE_VAL && force < HUGE_VAL && rounding < HUGE_VAL;
+  row[info_residual] = !known ? NAN : residual > rounding ? (residual - rounding) / whole : 0;
   row[info_energy] = sum[report_energy];
   row[info_inverted] = sum[report_inverted];
   if (!known) row[info_converged] = 0;

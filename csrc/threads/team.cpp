@@ -15,21 +15,21 @@
 namespace pd {
 namespace {
 
-std::atomic<Watch::Question> the_question{nullptr};
+std::atomic<Interrupt::Check> the_check{nullptr};
 
 struct Job {
   void (*work)(void* context, const Team& team);
   void* context;
   int size = 1;
-  Watch watch{};
-  Barrier barrier{watch};
+  Interrupt interrupt{};
+  Barrier barrier{interrupt};
   std::mutex failing{};
   std::exception_ptr failure{};
 
-  // An exception, as of memory that could not be had, must not leave a thread.
+  // An exception, such as a failed allocation, must not leave a thread.
   void run(int rank) {
     try {
-      work(context, {rank, size, size > 1 ? &barrier : nullptr, &watch, rank == 0});
+      work(context, {rank, size, size > 1 ? &barrier : nullptr, &interrupt, rank == 0});
     } catch (const Dismissed&) {
     } catch (...) {
       const std::lock_guard lock(failing);
@@ -38,33 +38,33 @@ struct Job {
   }
   void conclude() const {
     if (failure) std::rethrow_exception(failure);
-    watch.conclude();
+    interrupt.conclude();
   }
 };
 
-// How often this process is the child of a fork, which has none of its parent's threads but one.
+// Number of forks up to this process. A forked child has only one of its parent's threads.
 std::atomic<int> forks{0};
 const int registered = pthread_atfork(nullptr, nullptr, [] { ++forks; });
 
-// The threads that help the one they belong to. OpenMP's stay awake for milliseconds after their work, and a team of theirs
-// waits for every member. Where other processes want the cores, the first wastes time that the next work needs, and the second
-// takes a time slice of another process at every barrier.
-class Helpers {
+// The worker threads of one calling thread. OpenMP's poll for milliseconds after their work, and a team waits for
+// every member. On a busy machine the first wastes time that the next work needs. The second takes a time slice of
+// another process at every barrier.
+class Workers {
  public:
-  Helpers() = default;
-  Helpers(const Helpers&) = delete;
-  ~Helpers() {
+  Workers() = default;
+  Workers(const Workers&) = delete;
+  ~Workers() {
     {
       const std::lock_guard lock(joining_);
       leaving_ = true;
     }
-    call();
+    wake();
     for (std::thread& thread : threads_) thread.join();
   }
 
   bool are_of_this_process() const { return forks_ == forks; }
 
-  // By the team of those that come; alone for a while after a team was slow.
+  // Runs the job by the workers that start in time; alone for a while after a slow team.
   void run(Job& job, int wanted) {
     auto now = Barrier::Clock::now();
     if (now >= again_) now = gather(job, wanted);
@@ -75,81 +75,81 @@ class Helpers {
   }
 
  private:
-  // Starts those that come in time, at most `wanted`; the time then.
+  // Wakes at most `wanted` workers; returns the time when those in time have started.
   Barrier::Clock::time_point gather(Job& job, int wanted) {
     make(wanted);
     wanted = std::min(wanted, int(threads_.size()));
     {
       const std::lock_guard lock(joining_);
       job_ = &job;
-      seats_ = wanted;
+      openings_ = wanted;
       joined_.store(0, std::memory_order_relaxed);
     }
-    call();
-    const auto all_are_here = [&] { return joined_.load(std::memory_order_acquire) == wanted; };
+    wake();
+    const auto all_arrived = [&] { return joined_.load(std::memory_order_acquire) == wanted; };
     auto now = Barrier::Clock::now();
-    const auto latest = now + team_patience;
-    const auto look = [&] {
+    const auto latest = now + team_timeout;
+    const auto poll = [&] {
       std::this_thread::yield();
       now = Barrier::Clock::now();
     };
-    await([&] { return all_are_here() || now >= latest; }, look);
-    if (!all_are_here()) pause(now);
+    wait_until([&] { return all_arrived() || now >= latest; }, poll);
+    if (!all_arrived()) pause(now);
     {
       const std::lock_guard lock(joining_);
-      seats_ = 0;
+      openings_ = 0;
       job.size = 1 + joined_.load(std::memory_order_relaxed);
     }
     left_.store(job.size - 1, std::memory_order_relaxed);
-    begun_.store(calls_.load(std::memory_order_relaxed), std::memory_order_release);
+    begun_.store(wakes_.load(std::memory_order_relaxed), std::memory_order_release);
     begun_.notify_all();
     return now;
   }
 
   void finish(Job& job) {
     const auto all_are_done = [&] { return left_.load(std::memory_order_acquire) == 0; };
-    await(all_are_done, [&] {
+    wait_until(all_are_done, [&] {
       std::unique_lock lock(finishing_);
       finished_.wait_for(lock, std::chrono::milliseconds(50), all_are_done);
       lock.unlock();
-      job.watch.look();
+      job.interrupt.poll();
     });
   }
 
-  void pause(Barrier::Clock::time_point now) { again_ = now + 100 * team_patience; }
+  void pause(Barrier::Clock::time_point now) { again_ = now + 100 * team_timeout; }
 
   void make(int count) {
     try {
       while (int(threads_.size()) < count)
-        threads_.emplace_back([this, seen = calls_.load()] { serve(seen); });
+        threads_.emplace_back([this, seen = wakes_.load()] { serve(seen); });
     } catch (const std::system_error&) {  // the system grants no more
     }
   }
 
-  void call() {
-    calls_.fetch_add(1, std::memory_order_release);
-    calls_.notify_all();
+  void wake() {
+    wakes_.fetch_add(1, std::memory_order_release);
+    wakes_.notify_all();
   }
 
   void serve(std::uint32_t seen) {
     for (;;) {
-      await([&] { return calls_.load(std::memory_order_acquire) != seen; },
-            [&] { calls_.wait(seen, std::memory_order_acquire); });
+      wait_until([&] { return wakes_.load(std::memory_order_acquire) != seen; },
+                 [&] { wakes_.wait(seen, std::memory_order_acquire); });
       Job* job = nullptr;
       int rank = 0;
       {
         const std::lock_guard lock(joining_);
         if (leaving_) return;
-        seen = calls_.load(std::memory_order_relaxed);
-        if (seats_ > joined_.load(std::memory_order_relaxed)) {
+        seen = wakes_.load(std::memory_order_relaxed);
+        if (openings_ > joined_.load(std::memory_order_relaxed)) {
           job = job_;
           rank = 1 + joined_.fetch_add(1, std::memory_order_release);
         }
       }
       if (!job) continue;
       std::uint32_t begun = 0;
-      await([&] { return (begun = begun_.load(std::memory_order_acquire)) == seen; },
-            [&] { begun_.wait(begun, std::memory_order_acquire); });
+      wait_until([&] { return (begun = begun_.load(std::memory_order_acquire)) == seen; },
+                 [&] { begun_.wait(begun, std::memory_order_acquire); });
       job->run(rank);
       if (left_.fetch_sub(1, std::memory_order_acq_rel) > 1) continue;
       const std::lock_guard lock(finishing_);
@@ -160,32 +160,33 @@ class Helpers {
   const int forks_ = forks;
   std::vector<std::thread> threads_;
   Barrier::Clock::time_point again_{};  // when a team is tried again
-  std::atomic<std::uint32_t> calls_{0}, begun_{0};
+  std::atomic<std::uint32_t> wakes_{0}, begun_{0};
   std::mutex joining_;
   bool leaving_ = false;
   Job* job_ = nullptr;
-  int seats_ = 0;  // 0: the team is complete
+  int openings_ = 0;  // 0: the team is complete
   std::atomic<int> joined_{0}, left_{0};
   std::mutex finishing_;
   std::condition_variable finished_;
 };
 
-// The helpers of the calling thread. Those of a forked parent are never deleted: their threads do not exist here.
-class OwnHelpers {
+// The workers of the calling thread. After a fork the parent's workers are never deleted: their threads do not exist
+// here.
+class OwnWorkers {
  public:
-  ~OwnHelpers() {
-    if (helpers_ && helpers_->are_of_this_process()) delete helpers_;
+  ~OwnWorkers() {
+    if (workers_ && workers_->are_of_this_process()) delete workers_;
   }
-  Helpers& get() {
-    if (!helpers_ || !helpers_->are_of_this_process()) helpers_ = new Helpers;
-    return *helpers_;
+  Workers& get() {
+    if (!workers_ || !workers_->are_of_this_process()) workers_ = new Workers;
+    return *workers_;
   }
 
  private:
-  Helpers* helpers_ = nullptr;
+  Workers* workers_ = nullptr;
 };
 
-thread_local OwnHelpers own_helpers;
+thread_local OwnWorkers own_workers;
 thread_local bool in_team = false;
 
 struct InTeam {
@@ -196,18 +197,18 @@ struct InTeam {
 
 }  // namespace
 
-void Watch::set_question(Question question) { the_question = question; }
+void Interrupt::set_check(Check check) { the_check = check; }
 
-void Watch::look() {
-  constexpr auto between_questions = std::chrono::milliseconds(200);
+void Interrupt::poll() {
+  constexpr auto between_checks = std::chrono::milliseconds(200);
   const auto now = std::chrono::steady_clock::now();
   const bool first = next_ == std::chrono::steady_clock::time_point{};
   const bool early = first || now < next_;
-  if (first || !early) next_ = now + between_questions;
-  const Question question = the_question;
-  if (early || !question || failure_) return;
+  if (first || !early) next_ = now + between_checks;
+  const Check check = the_check;
+  if (early || !check || failure_) return;
   try {
-    question();
+    check();
   } catch (...) {
     failure_ = std::current_exception();
     ended_.store(true, std::memory_order_relaxed);
@@ -226,7 +227,7 @@ void run_team(int threads, void (*work)(void*, const Team&), void* context) {
   Job job{work, context};
   if (threads > 1 && !in_team) {
     const InTeam inside;
-    own_helpers.get().run(job, threads - 1);
+    own_workers.get().run(job, threads - 1);
   } else {
     job.run(0);
   }

@@ -1,4 +1,4 @@
-// A few threads that work on one thing together.
+// Threads that work on one task together.
 #pragma once
 
 #include <atomic>
@@ -8,10 +8,10 @@
 
 namespace pd {
 
-// Whether done() becomes true while this thread looks so many times.
+// Polls done() so many times; returns whether it became true.
 template <class Done>
-bool comes_soon(int looks, Done done) {
-  for (int look = 0; look < looks; ++look) {
+bool spin_until(int polls, Done done) {
+  for (int poll = 0; poll < polls; ++poll) {
     if (done()) return true;
 #if defined(__x86_64__)
     __builtin_ia32_pause();
@@ -22,125 +22,125 @@ bool comes_soon(int looks, Done done) {
   return false;
 }
 
-// Waits until done(): a few microseconds awake, since most waits are as short, then by sleep(). On a busy machine a thread
-// that stayed awake would keep the one that it waits for from running.
+// Waits until done(): a few microseconds of polling, since most waits are as short, then by sleep(). On a busy
+// machine a polling thread would keep the awaited one from running.
 template <class Done, class Sleep>
-void await(Done done, Sleep sleep) {
-  if (comes_soon(500, done)) return;
+void wait_until(Done done, Sleep sleep) {
+  if (spin_until(500, done)) return;
   while (!done()) sleep();
 }
 
-// How long a team is waited for before its caller goes on alone: far longer than an idle core takes to wake up, and shorter
-// than other processes keep one.
-constexpr std::chrono::milliseconds team_patience{1};
+// How long the caller waits for a team before it continues alone. An idle core wakes up far sooner; another process
+// keeps a core for longer.
+constexpr std::chrono::milliseconds team_timeout{1};
 
-// Whether a call is to end before its work is done, as Ctrl-C asks for. The calling thread asks, now and then.
-class Watch {
+// Interrupts a call before its work is done, as Ctrl-C asks for. The calling thread polls now and then.
+class Interrupt {
  public:
-  // Throws what a call is to end with, or returns. None: no call ends early.
-  using Question = void (*)();
-  static void set_question(Question question);
+  // Throws the exception that ends the call, or returns. None: no call ends early.
+  using Check = void (*)();
+  static void set_check(Check check);
 
-  // To be called by the calling thread after so much work [vertices]: short calls never read the clock.
-  void worked(std::int64_t amount) {
-    amount_ += amount;
-    if (amount_ < amount_between_looks) return;
-    amount_ = 0;
-    look();
+  // Called by the calling thread after so much work [vertices]: short calls never read the clock.
+  void count_work(std::int64_t work) {
+    work_ += work;
+    if (work_ < work_between_polls) return;
+    work_ = 0;
+    poll();
   }
-  // Asks, if that was not done for a while.
-  void look();
+  // Runs the check, unless the last one is recent.
+  void poll();
   bool ended() const { return ended_.load(std::memory_order_relaxed); }
-  // Throws what the question threw.
+  // Throws the exception of the check.
   void conclude() const {
     if (failure_) std::rethrow_exception(failure_);
   }
 
  private:
-  static constexpr std::int64_t amount_between_looks = 1 << 16;  // some milliseconds
+  static constexpr std::int64_t work_between_polls = 1 << 16;  // some milliseconds
 
-  std::int64_t amount_ = 0;
+  std::int64_t work_ = 0;
   std::chrono::steady_clock::time_point next_{};
   std::exception_ptr failure_;
   std::atomic<bool> ended_{false};
 };
 
-// Where the members of a team meet.
+// Barrier of a team's members.
 class Barrier {
  public:
   using Clock = std::chrono::steady_clock;
 
-  explicit Barrier(Watch& watch) : watch_(watch) {}
+  explicit Barrier(Interrupt& interrupt) : interrupt_(interrupt) {}
   void begin(Clock::time_point now) { begun_ = now; }
 
   void wait(int size, bool calls) {
     const std::uint32_t phase = phase_.load(std::memory_order_acquire);
     if (arrived_.fetch_add(1, std::memory_order_acq_rel) + 1 == size) {
       arrived_.store(0, std::memory_order_relaxed);
-      ended_ = watch_.ended();
-      splits_ = slow();
+      ended_ = interrupt_.ended();
+      is_split_ = slow();
       phase_.fetch_add(1, std::memory_order_acq_rel);
       phase_.notify_all();
       return;
     }
-    const auto all_are_here = [&] { return phase_.load(std::memory_order_acquire) != phase; };
+    const auto all_arrived = [&] { return phase_.load(std::memory_order_acquire) != phase; };
     // most waits are too short to be timed
-    if (comes_soon(50, all_are_here)) return;
+    if (spin_until(50, all_arrived)) return;
     const auto before = calls ? Clock::now() : Clock::time_point{};
-    await(all_are_here, [&] { phase_.wait(phase, std::memory_order_acquire); });
+    wait_until(all_arrived, [&] { phase_.wait(phase, std::memory_order_acquire); });
     if (calls) count(before, size);
   }
-  // What the watch said when the last member came: the same for all of them until they meet again.
+  // The interrupt's state when the last member arrived: the same for all members until the next barrier.
   bool ended() const { return ended_; }
-  // Whether it was `slow` then.
-  bool splits() const { return splits_; }
-  // Whether the calling thread would have got further alone: it has waited longer than the others' shares take.
+  // Whether the team was `slow` then.
+  bool is_split() const { return is_split_; }
+  // Whether the calling thread would have been faster alone: it has waited longer than the others' shares take.
   bool slow() const { return slow_.load(std::memory_order_relaxed); }
 
  private:
   void count(Clock::time_point before, int size) {
-    watch_.look();
+    interrupt_.poll();
     const auto now = Clock::now();
     waited_ += now - before;
     const auto others_share = (size - 1) * (now - begun_ - waited_);
-    if (waited_ > others_share + team_patience) slow_.store(true, std::memory_order_relaxed);
+    if (waited_ > others_share + team_timeout) slow_.store(true, std::memory_order_relaxed);
   }
 
-  Watch& watch_;
+  Interrupt& interrupt_;
   std::atomic<int> arrived_{0};
   std::atomic<std::uint32_t> phase_{0};
-  bool ended_ = false, splits_ = false;
+  bool ended_ = false, is_split_ = false;
   std::atomic<bool> slow_{false};
   Clock::time_point begun_{};
   Clock::duration waited_{0};
 };
 
-// Thrown in the members that a team goes on without.
+// Thrown in members that the team continues without.
 struct Dismissed {};
 
 struct Team {
   int rank = 0;
   mutable int size = 1;               // may become 1 in `ended`
   mutable Barrier* shared = nullptr;  // null for a team of one
-  Watch* watch = nullptr;
-  bool calls = false;  // whether this is the thread that called
+  Interrupt* interrupt = nullptr;
+  bool calls = false;  // the calling thread
 
   void barrier() const {
     if (shared) shared->wait(size, calls);
   }
-  // This member as a team of its own.
-  Team alone() const { return {0, 1, nullptr, watch, calls}; }
-  // Whether to stop, after so much work [vertices]. Between two barriers all members get the same answer. Nothing is half
-  // done here, so the calling thread goes on alone if other processes keep the others from their cores. Its share grows then,
-  // but no number changes, as none depends on the size of a team.
+  // This member as a team of one.
+  Team alone() const { return {0, 1, nullptr, interrupt, calls}; }
+  // Whether to stop, after so much work [vertices]. Between two barriers all members get the same answer. No
+  // operation is half done here, so the calling thread continues alone if other processes keep the members from their
+  // cores. Its share grows then, but no number changes, as none depends on the size of a team.
   bool ended(std::int64_t work) const {
-    if (calls) watch->worked(work);
-    if (shared && shared->splits()) {
+    if (calls) interrupt->count_work(work);
+    if (shared && shared->is_split()) {
       if (!calls) throw Dismissed{};
       size = 1;
       shared = nullptr;
     }
-    return shared ? shared->ended() : watch->ended();
+    return shared ? shared->ended() : interrupt->ended();
   }
   // first item of this member's share of `count`, and of the next member's
   std::int64_t begin(std::int64_t count) const { return count * rank / size; }
@@ -150,8 +150,9 @@ struct Team {
 // How many threads this process may use at most.
 int most_threads();
 
-// Calls work(context, team) in every thread of a team of at most `threads`, the calling one and those that come at once; alone
-// inside another team. Throws what a member threw, or what the watch's question did.
+// Calls work(context, team) in every thread of a team: the caller and those of at most `threads` - 1 others that
+// start in time. Inside another team the caller works alone. Throws the exception of a member or of the interrupt
+// check.
 void run_team(int threads, void (*work)(void* context, const Team& team), void* context);
 
 template <class Work>

@@ -1,4 +1,4 @@
-// Shared memory that the kernels of a plan ask for: known without a GPU, because it decides which kernel a plan is for.
+// Shared memory of a plan's kernels. It is known without a GPU, because it decides which kernel a plan is for.
 #pragma once
 #include "views/views.h"
 
@@ -9,57 +9,59 @@ namespace pd {
 
 constexpr std::size_t fused_control_bytes = 1024;
 
-// Of a multiprocessor, which the shape of a block is chosen for: of more of them it has no room for all.
+// Upper bound of environments per multiprocessor for choosing a block's shape.
 constexpr int most_environments = 1 << 20;
 
-// Of meshes whose environments share blocks, in float32 with kernel block (cuda/small_batch/runner.h).
+// Largest mesh whose environments share blocks, in float32 with kernel block (cuda/small_batch/runner.h).
 constexpr int most_sharing_pairs = 192;
 
-// `bytes` and what fills them up to a multiple of 16
+// `bytes` rounded up to a multiple of 16
 constexpr std::size_t aligned(std::size_t bytes) { return (bytes + 15) / 16 * 16; }
 
-// one vector of every slot in four numbers, or two in six (cuda/common/slots.h)
+// one vector of every slot as four numbers, or two vectors as six (cuda/common/slots.h)
 constexpr std::size_t slots_bytes(std::size_t real, std::size_t slots, std::size_t vectors) {
   return vectors == 1 ? 4 * real * slots : aligned(6 * real * slots);
 }
 
-// With one patch position and u of every slot, with `many` position; an entry for every corner of a pair;
-// planes and balls as the numbers of their rows.
+// One patch keeps position and u of every slot, `many` patches only position. Both keep an entry for every corner of
+// a pair, and the rows of planes and spheres.
 constexpr std::size_t fused_shared_bytes(std::size_t real, bool many, std::size_t slots,
                                          std::size_t entries, std::size_t planes,
-                                         std::size_t balls) {
+                                         std::size_t spheres) {
   return fused_control_bytes + slots_bytes(real, slots, 1) * (many ? 1 : 2) +
-         real * (4 * entries + planes_numbers * planes + spheres_numbers * balls);
+         real * (4 * entries + planes_numbers * planes + spheres_numbers * spheres);
 }
 
-// A cluster of blocks: the most that one has, and what each keeps for sums (cuda/common/cluster_sums.h).
+// Most blocks of a cluster, and the memory of each block for sums (cuda/common/cluster_sums.h).
 constexpr std::size_t most_cluster_blocks = 16;
 constexpr std::size_t cluster_sums_bytes =
     2 * sizeof(std::uint64_t) + 2 * most_cluster_blocks * 3 * sizeof(double);
 
-// what each keeps of positions (cuda/fused/halo.h), those of two iterations, as of entries
+// positions of other blocks (cuda/fused/halo.h), double-buffered over two iterations, like entries
 constexpr std::size_t halo_bytes(std::size_t real, std::size_t slots) {
   return 2 * sizeof(std::uint64_t) + 2 * 4 * real * slots;
 }
 
-// and of energies: one of every thread
+// energies: one of every thread
 constexpr std::size_t cluster_energy_bytes = 512 * sizeof(double);
 
-// Without x, velocity, target, u, before and origin of its own vertices, which it has there too.
+// The part before x, velocity, target, u, before and origin of a block's own vertices, which follow.
 constexpr std::size_t cluster_vertices_begin(std::size_t real, std::size_t slots,
                                              std::size_t entries, std::size_t planes,
-                                             std::size_t balls) {
+                                             std::size_t spheres) {
   return fused_control_bytes + cluster_sums_bytes + cluster_energy_bytes + halo_bytes(real, slots) +
-         aligned(real * (2 * 4 * entries + planes_numbers * planes + spheres_numbers * balls));
+         aligned(real * (2 * 4 * entries + planes_numbers * planes + spheres_numbers * spheres));
 }
 constexpr std::size_t cluster_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                            std::size_t interior, std::size_t planes,
-                                           std::size_t balls) {
-  return cluster_vertices_begin(real, slots, entries, planes, balls) + 6 * 4 * real * interior;
+                                           std::size_t spheres) {
+  return cluster_vertices_begin(real, slots, entries, planes, spheres) + 6 * 4 * real * interior;
 }
 
-// Threads of a block that has one of several patches, and whether the patch is so small that each thread has one slot at
-// most, and in float32 one tetrahedron; of float64 there are too few threads for that.
+// Threads of a block with one of several patches.
+//
+// A patch is near if each thread has at most one slot, and in float32 one tetrahedron; float64 has too few threads
+// for that.
 constexpr std::size_t most_patch_threads(std::size_t real) { return real == 4 ? 512 : 256; }
 constexpr bool near_once(std::size_t real) { return real == 4; }
 constexpr bool is_near(std::size_t real, std::size_t slots, std::size_t pairs,
@@ -67,8 +69,8 @@ constexpr bool is_near(std::size_t real, std::size_t slots, std::size_t pairs,
   return slots <= threads && (!near_once(real) || 2 * pairs <= threads);
 }
 
-// Lanes that a block of a cluster has for each vertex of its own (cuda/fused/halo.h), eight where there are threads for it
-// anyway, else four; and its threads, of which there must be no more than those: one warp has nothing but to lead.
+// Lanes of a cluster's block for each own vertex (cuda/fused/halo.h): eight if there are threads for them anyway, else
+// four. A block has no more threads than those, and one warp that only leads.
 constexpr std::size_t whole_warps(std::size_t threads) { return (threads + 31) / 32 * 32; }
 constexpr std::size_t halo_lanes(std::size_t real, std::size_t pairs, std::size_t interior) {
   const std::size_t all = near_once(real) ? whole_warps(2 * pairs) : most_patch_threads(real) - 32;
@@ -80,28 +82,28 @@ constexpr std::size_t cluster_threads(std::size_t real, std::size_t pairs, std::
   return whole_warps(own > tets ? own : tets) + 32;
 }
 
-// what a pass keeps beside: three sums of up to 32 warps
+// static memory of a pass: three sums of up to 32 warps
 constexpr std::size_t pass_static_bytes = 3 * 32 * sizeof(double);
 
-// the same with all that the iterations of the multilevel solver keep
+// static memory of the multilevel solver's iterations
 constexpr std::size_t outer_static_bytes = 5120;
 
-// `fields` vectors of every slot, one or two
+// memory for `fields` vectors of every slot, one or two
 constexpr std::size_t pass_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries,
                                         std::size_t fields) {
   return slots_bytes(real, slots, fields) + 4 * real * entries;
 }
 
-// One of the two halves of a pipeline's shared memory (cuda/stream/pipeline.h): position and rest position of every slot, then entries
-// of three numbers, since a fourth would take its room from the cache.
+// One of the two halves of a pipeline's shared memory (cuda/stream/pipeline.h): position and rest position of every slot,
+// then entries of three numbers. A fourth would reduce the cache.
 constexpr int pipeline_slots = 1024;  // of a patch, at most
 constexpr std::size_t pipeline_half_bytes(std::size_t real, std::size_t slots,
                                           std::size_t entries) {
   return slots_bytes(real, slots, 2) + aligned(3 * real * entries);
 }
 
-// The small problem of the multilevel solver, with the schedule that has one: what it keeps, and the least that it wants of
-// the memory of a pass while it is made. Tetrahedra of which it has so many numbers are faster in more.
+// Memory of the multilevel solver's coarse problem, and the least scratch memory while it is built. Tetrahedra with
+// so many numbers are faster with more.
 constexpr std::size_t corotation_bytes = 11264;
 constexpr std::size_t turning_tile_numbers = 49;
 constexpr std::size_t turning_scratch_bytes = 4 * 24 * 24 * sizeof(double);
@@ -109,7 +111,7 @@ constexpr std::size_t corotation_begin(std::size_t pass_bytes, std::size_t scrat
   return aligned(pass_bytes < scratch_bytes ? scratch_bytes : pass_bytes);
 }
 
-// of a block, by a plan for the multilevel solver
+// shared memory of a block, with a plan for the multilevel solver
 constexpr std::size_t outer_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries) {
   return corotation_begin(pass_shared_bytes(real, slots, entries, 2), turning_scratch_bytes) +
          corotation_bytes + outer_static_bytes;

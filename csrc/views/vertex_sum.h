@@ -1,4 +1,4 @@
-// Sums over the vertices of every environment, in an order that the batch has no part in.
+// Sums over the vertices of every environment, in an order that does not depend on the batch.
 #pragma once
 #include <cstdint>
 

@@ -1,4 +1,4 @@
-// What a kernel sees: plain structs of pointers, made from the tables. Knows neither torch nor a device.
+// The plain structs of pointers that kernels read, made from the tables. Independent of torch and of any device.
 #pragma once
 
 #include "math/device.h"
@@ -10,12 +10,12 @@ namespace pd {
 using int16 = std::int16_t;
 using int32 = std::int32_t;
 
-// Numbers of a plan's array of sizes.
+// Entries of a plan's array of sizes.
 enum PlanSize : int {
   plan_vertices,
   plan_tets,
   plan_pins,
-  plan_groups,
+  plan_components,
   plan_blocks,
   plan_patches,
   plan_slots,
@@ -24,19 +24,19 @@ enum PlanSize : int {
   plan_size_count
 };
 
-// Numbers of a preconditioner's array of sizes; without a middle level its numbers are 0.
+// Entries of a preconditioner's array of sizes; without a middle level its entries are 0.
 enum LevelSize : int {
   level_fine_entries,
-  level_fine_lifts,
+  level_fine_prolongations,
   level_fine_nodes,  // below the fine level
   level_middle_entries,
-  level_middle_lifts,
+  level_middle_prolongations,
   level_middle_nodes,  // below the middle level
   level_direct,        // 1: no levels, A itself is solved directly
   level_size_count
 };
 
-// A multilevel approximation of A^-1: see plan/multilevel/build.h and solver/multilevel/lbfgs.h. All null where there is none.
+// A multilevel approximation of A^-1: see plan/multilevel/build.h and solver/multilevel/lbfgs.h. Without one all are null.
 template <class T>
 struct Levels {
   using real = T;
@@ -53,7 +53,7 @@ struct Levels {
   }
 };
 
-// Its counts, from its array of sizes; without the other arrays.
+// The counts of a plan or its levels, from their array of sizes; without the other arrays.
 template <class T>
 Levels<T> count_levels(const int32* sizes, int vertices) {
   Levels<T> levels;
@@ -70,15 +70,16 @@ struct Plan {
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/cpu_plan.def"
 #undef X
-  int vertices = 0, tets = 0, pins = 0, groups = 0, blocks = 0, patches = 0, slots = 0, shared = 0;
+  int vertices = 0, tets = 0, pins = 0, components = 0, blocks = 0, patches = 0, slots = 0,
+      shared = 0;
   int most_slots = 0;  // of any patch
   Levels<T> levels;
 };
 
-// Of a pair of tetrahedra in pair_rest, see gpu_plan.def.
+// Numbers of a pair of tetrahedra in pair_rest, see gpu_plan.def.
 constexpr int pair_rest_numbers = 12;
 
-// Numbers of DevicePlan::sizes, as DevicePlan itself has them too.
+// Entries of DevicePlan::sizes, which are members of DevicePlan too.
 enum DeviceSize : int {
 #define X(name, meaning) size_##name,
 #include "views/gpu_sizes.def"
@@ -86,7 +87,7 @@ enum DeviceSize : int {
   size_count
 };
 
-// The constant arrays on a GPU. All but `sizes` are in its memory.
+// The constant arrays of a GPU plan. All but `sizes` are in the GPU's memory.
 template <class T>
 struct DevicePlan {
   using real = T;
@@ -99,7 +100,7 @@ struct DevicePlan {
   Levels<T> levels;
 };
 
-// Its counts, from its array of sizes; without the other arrays.
+// The counts of a plan or its levels, from their array of sizes; without the other arrays.
 template <class T>
 DevicePlan<T> count_device_plan(const int32* sizes) {
   DevicePlan<T> plan;
@@ -109,7 +110,7 @@ DevicePlan<T> count_device_plan(const int32* sizes) {
   return plan;
 }
 
-// Of pairs, by which kernels count the corners of all of them, 5 times 32 of a block, in 32 bits (cuda/elements/pairs_per_thread.h).
+// Largest number of blocks: kernels count the corners of all pairs, 5 times 32 a block, in 32 bits (cuda/elements/pairs_per_thread.h).
 constexpr std::int64_t most_blocks = (std::int64_t(1) << 32) / (5 * 32);
 
 // Numbers in a row of each array of the material.
@@ -145,7 +146,7 @@ struct Material {
   int planes_count = 0, spheres_count = 0;
 };
 
-// from lbfgs on multilevel
+// from lbfgs on, the solver is multilevel
 enum class ScheduleKind : int {
   jacobi = 0,
   classic = 1,
@@ -164,11 +165,11 @@ struct Settings {
 
   PD_HD StartKind start() const { return inertial; }
   PD_HD bool multilevel() const { return schedule >= ScheduleKind::lbfgs; }
-  // by L-BFGS
+  // whether L-BFGS corrects the direction
   PD_HD bool learns() const { return multilevel() && schedule != ScheduleKind::momentum; }
 };
 
-// Numbers of an info row, double each. A step leaves residual and energy NaN and inverted -1; a report fills them in.
+// Entries of an info row, double each. A step leaves residual and energy NaN and inverted -1; a report fills them in.
 enum InfoField : int {
   info_residual,
   info_energy,
@@ -180,7 +181,7 @@ enum InfoField : int {
   info_count
 };
 
-// Everything one call of step or rollout works on. Positions in the user's order, [batch, vertices, 3].
+// Inputs and outputs of a call of step or rollout. Positions are in the user's order, [batch, vertices, 3].
 template <class T, class P = Plan<T>>
 struct StepCall {
   P plan;
@@ -199,7 +200,7 @@ struct StepCall {
 template <class T>
 using DeviceStep = StepCall<T, DevicePlan<T>>;
 
-// Elastic energy and its derivatives at given positions, and the diagonal that bounds its second ones.
+// Fields of the elastic energy at given positions: its derivatives, and the diagonal that bounds the second ones.
 enum class Field : int {
   gradient,
   hessian_product,
@@ -215,35 +216,35 @@ struct FieldCall {
   Field field = Field::gradient;
   Values<T> stiffness;
   std::int64_t batch = 0;
-  bool weighted = false;         // with l_e, by the diagonal
-  const T* positions = nullptr;  // [batch, vertices, 3], by all but the diagonal
+  bool weighted = false;         // weighted by l_e; for the diagonal
+  const T* positions = nullptr;  // [batch, vertices, 3], for all but the diagonal
   const T* displacement =
-      nullptr;  // [batch, vertices, 3] on top of the positions, whose sum is not rounded; may be null
-  const T* direction = nullptr;  // [batch, vertices, 3], by the products
+      nullptr;  // [batch, vertices, 3] added to the positions without rounding the sum; may be null
+  const T* direction = nullptr;  // [batch, vertices, 3], for the products
   T* out =
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
 };
 
-// Sums over the vertices of an environment that a report is made of, see solver/report.h.
+// Sums over the vertices of an environment for a report, see solver/report.h.
 enum ReportSum : int {
   report_energy,
-  report_unbalanced,
+  report_residual,
   report_force,
   report_rounding,
   report_inverted,
-  report_wrong,
+  report_invalid,
   report_sums
 };
 
-// Vertices that one row of sums covers.
+// Vertices in one row of sums.
 constexpr int report_chunk = 256;
 
-// What a step that was taken says of itself, by the user's numbers of vertices.
+// The report of a solved step, by the user's numbers of vertices.
 template <class T, class P = Plan<T>>
 struct ReportCall {
   P plan;
   Material<T> material;
-  Values<T> elastic;  // [vertices] diagonal of elasticity, as the step had it
+  Values<T> elastic;  // [vertices] elastic diagonal, as in the step
   std::int64_t batch = 0;
   double time_step = 0;
   const T* positions = nullptr;  // [batch, vertices, 3] each, at the start of the step
@@ -253,7 +254,7 @@ struct ReportCall {
   const T* elastic_gradient = nullptr;
   const T* elements = nullptr;  // Field::report
   double* sums = nullptr;       // [batch, chunks, report_sums]
-  double* info = nullptr;       // [batch, info_count], of the step, whose blanks are filled in
+  double* info = nullptr;       // [batch, info_count] of the step; the report fills in its blanks
 
   PD_HD int chunks() const { return (plan.vertices + report_chunk - 1) / report_chunk; }
 };
@@ -264,17 +265,17 @@ struct AdjointSystemCall {
   P plan;
   Material<T> material;
   Values<T> elastic;       // [vertices] weighted diagonal of elasticity
-  std::int64_t batch = 0;  // of the right sides
+  std::int64_t batch = 0;  // batch of the right sides
   std::int64_t rows =
-      1;  // of inertia and inverse: 1, where environments share all that they come from, or the batch
+      1;  // rows of inertia and inverse: 1 if environments share all their inputs, else the batch
   double time_step = 0;
   const T* grad_positions = nullptr;  // [batch, vertices, 3] each
   const T* grad_velocities = nullptr;
   T* right = nullptr;
   T* inertia = nullptr;  // [rows, vertices]
   T* inverse = nullptr;
-  // what only contacts ask for, else null: the step [batch, vertices, 3], the gradient of its elastic energy, and what of every
-  // vertex is free
+  // inputs of contacts, else null: the step [batch, vertices, 3], the gradient of its elastic energy, and outputs
+  // that say which directions of a vertex are free
   const T* after = nullptr;
   const T* positions = nullptr;
   const T* velocities = nullptr;
@@ -285,24 +286,26 @@ struct AdjointSystemCall {
   T* sliding = nullptr;    // [batch, vertices, slide_count, 3]
 };
 
-// Vectors of a vertex that slides against the friction of one contact, else zero: friction times the direction of slip; the
-// normal; the direction across both, times the square root of what the turning of the slip adds to H there. Of a surface that
-// curves also the direction of slip, times the square root of what that takes off; and the third of them, times the motion
-// along the normal over the radius, by which the slip turns less.
+// Vectors of a vertex that slides against the friction of one contact, else zero.
+//   along    friction times the direction of slip
+//   normal   the contact normal
+//   across   third direction, times the square root of the term that the slip's rotation adds to H
+//   bend     direction of slip, times the square root of the term that a curved surface takes from H
+//   lean     across, times the motion along the normal over the radius: the slip rotates less by it
 enum Slide : int { slide_along, slide_normal, slide_across, slide_bend, slide_lean, slide_count };
 
-// What a solved adjoint says of the contacts that hold vertices.
+// Gradients by the contacts that hold vertices, from a solved adjoint.
 template <class T, class P = Plan<T>>
 struct ContactGradientsCall {
-  AdjointSystemCall<T, P> step;   // whose outputs are not written
+  AdjointSystemCall<T, P> step;   // its outputs are not written
   const T* multiplier = nullptr;  // [batch, vertices, 3] each
   const T* elastic = nullptr;     // elastic Hessian times the multiplier
-  // of every vertex, by the columns of views/material.def; zeros where it touches nothing; null where nobody wants them
+  // for every vertex, by the columns of views/material.def; zeros where it touches nothing; null if not requested
   T* planes = nullptr;   // [batch, vertices, planes, planes_numbers]
   T* spheres = nullptr;  // [batch, vertices, spheres, spheres_numbers]
 };
 
-// What a solved adjoint says of the state before the step.
+// Gradients by the state before the step, from a solved adjoint.
 template <class T>
 struct AdjointResultCall {
   Values<T> masses, damping;
@@ -310,10 +313,10 @@ struct AdjointResultCall {
   double time_step = 0;
   const T* multiplier = nullptr;  // [batch, vertices, 3] each
   const T* grad_velocities = nullptr;
-  const double* error = nullptr;  // of each environment
+  const double* error = nullptr;  // error of each environment
   std::int64_t error_stride = 1;
-  // of a scene with contacts, else null: dL/dx', elastic Hessian times the multiplier, what contacts let through, and which
-  // vertices friction holds
+  // only with contacts, else null: dL/dx', elastic Hessian times the multiplier, projector on the free directions,
+  // and the vertices that friction holds
   const T* grad_positions = nullptr;
   const T* elastic = nullptr;
   const T* projector = nullptr;  // [batch, vertices, 3, 3]
@@ -324,9 +327,9 @@ struct AdjointResultCall {
   T* out_multiplier = nullptr;
 };
 
-// Numbers of an environment in the progress of a solve: r . z, |right side|, 1 while it goes on, 0 after, -1 before, and the
-// residual relative to the right side. Before, the first iteration works out the others, by a residual that is the right side.
-// No number for an error: something in right side or positions is infinite or no number.
+// An environment's entries in the progress of a solve: r . z; |right side|; 1 while it runs, 0 after, -1 before; and
+// the residual relative to the right side. The first iteration computes the other entries from a residual that equals
+// the right side. The error is NaN if right side or positions are infinite or NaN.
 enum ConjugateProgress : int {
   progress_product,
   progress_scale,
@@ -335,19 +338,19 @@ enum ConjugateProgress : int {
   progress_count
 };
 
-// Numbers of an environment in the progress of the solve that follows where vertices slide against friction, zero before: what it
-// does next (FrictionStage), s . r of BiCGStab, the true residual relative to the right side, and products that are left.
+// An environment's entries in the progress of the BiCGStab solve, zero before: its next stage (FrictionStage), s . r,
+// the true residual relative to the right side, and the products left.
 enum FrictionProgress : int {
   friction_stage,
   friction_product,
   friction_error,
-  friction_left,
+  friction_products_left,
   friction_count
 };
 
-// Iterations of conjugate gradients on (inertia + elastic Hessian) solution = right side, for each environment by itself;
-// preconditioned by a diagonal, or by a plan's levels where it has them. With `friction` those of solver/adjoint/friction.h follow
-// where something slides, and what it ends with is the multiplier.
+// Conjugate gradients on (inertia + elastic Hessian) solution = right side, for each environment by itself. The
+// preconditioner is a diagonal, or a plan's levels where it has them. With `friction` the solve of
+// solver/adjoint/friction.h follows where vertices slide; its solution is the multiplier.
 template <class T, class P = Plan<T>>
 struct ConjugateCall {
   P plan;
@@ -355,10 +358,9 @@ struct ConjugateCall {
   Values<T> inertia, inverse;  // [vertices]; inverse diagonal, 0 where a vertex does not move
   std::int64_t batch = 0;
   const T* positions = nullptr;  // [batch, vertices, 3]
-  const T* projector =
-      nullptr;  // [batch, vertices, 3, 3] of what contacts let through; may be null
+  const T* projector = nullptr;  // [batch, vertices, 3, 3] on the free directions; may be null
   const T* sliding =
-      nullptr;  // [batch, vertices, slide_count, 3], whose slide_across H has; may be null
+      nullptr;  // [batch, vertices, slide_count, 3], slide_across being part of H; may be null
   const T* right = nullptr;    // [batch, vertices, 3], with friction
   double* friction = nullptr;  // [batch, friction_count]; null: no friction
   T* solution = nullptr;       // [batch, vertices, 3] each, from zero
@@ -366,10 +368,10 @@ struct ConjugateCall {
   T* direction = nullptr;
   double* progress = nullptr;  // [batch, progress_count]
   double tolerance = 0;        // of the residual, relative to the right side
-  int iterations = 0;          // products, where friction follows
+  int iterations = 0;          // counts products if friction follows
 };
 
-// The approximation of A^-1 of a vector for each vertex.
+// Applies the approximation of A^-1 to a vector for each vertex.
 template <class T>
 struct PreconditionCall {
   Levels<T> levels;

@@ -63,12 +63,12 @@ def reordered(levels: dict[str, np.ndarray], place: np.ndarray) -> dict[str, np.
     out["fine_start"], out["fine_column"] = matrix.indptr, matrix.indices
     out["fine_value"] = levels["fine_value"][matrix.data]
     nodes = int(levels["level_sizes"][2])
-    lift = moved_rows(levels["fine_lift_start"], levels["fine_lift_node"], nodes, np.arange(nodes))
+    lift = moved_rows(levels["fine_prolongation_start"], levels["fine_prolongation_node"], nodes, np.arange(nodes))
     lift.sort_indices()
-    out["fine_lift_start"], out["fine_lift_node"] = lift.indptr, lift.indices
-    out["fine_lift_weight"] = levels["fine_lift_weight"][lift.data]
+    out["fine_prolongation_start"], out["fine_prolongation_node"] = lift.indptr, lift.indices
+    out["fine_prolongation_weight"] = levels["fine_prolongation_weight"][lift.data]
     by_node = csr_array((np.arange(lift.nnz), lift.indices, lift.indptr), shape=lift.shape).tocsc()
-    out["fine_node_row"], out["fine_node_lift"] = by_node.indices, by_node.data
+    out["fine_node_row"], out["fine_node_prolongation"] = by_node.indices, by_node.data
     return out
 
 

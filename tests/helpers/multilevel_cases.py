@@ -92,7 +92,7 @@ def converged(case: Case, **options: Any) -> Array:
 
 
 def build_levels(sim: pd.Simulator, *, folded: bool) -> dict[str, Any]:
-    """The arrays of its preconditioner, which has levels, in float64, with lifts as a GPU has them or as a CPU does."""
+    """The arrays of its preconditioner, which has levels, in float64; `folded`: as a GPU plan has them."""
     stiffness, inertia = (array.cpu().double().numpy() for array in stored_reference(sim.plan.arrays))
     values, order = sim.scene.values(), sim.plan.vertex_order.cpu().numpy()
     return _C.build_multilevel(
@@ -114,7 +114,7 @@ class Tables:
                 (
                     csr_array((t["fine_value"], t["fine_column"], t["fine_start"]), shape=(count, count)),
                     t["fine_inverse"].reshape(-1, 1),
-                    self._blocks(t, "fine_lift", 1, (count, 4 * nodes)),
+                    self._blocks(t, "fine_prolongation", 1, (count, 4 * nodes)),
                 )
             )
         if below:
@@ -124,7 +124,7 @@ class Tables:
                 (
                     csr_array(bsr_array((value, t["middle_column"], t["middle_start"]), shape=shape)),
                     t["middle_inverse"].reshape(-1, 1),
-                    self._blocks(t, "middle_lift", 4, (4 * nodes, 4 * below)),
+                    self._blocks(t, "middle_prolongation", 4, (4 * nodes, 4 * below)),
                 )
             )
         size = count if direct else 4 * (below or nodes)
@@ -150,9 +150,9 @@ class Tables:
     def _cycle(self, level: int, right: Array) -> Array:
         if level == len(self.levels):
             return np.asarray(self.factor.T @ (self.factor @ right))
-        matrix, inverse, lift = self.levels[level]
+        matrix, inverse, prolongation = self.levels[level]
         z = self.smooth(matrix, inverse, right)
-        z = z + lift @ self._cycle(level + 1, lift.T @ (right - matrix @ z))
+        z = z + prolongation @ self._cycle(level + 1, prolongation.T @ (right - matrix @ z))
         return np.asarray(z + self.smooth(matrix, inverse, right - matrix @ z))
 
     def __call__(self, field: Array) -> Array:

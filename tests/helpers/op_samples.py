@@ -84,12 +84,12 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
         "adjoint_result": (
             (f, errors, direction, material, f, direction, projector, x[..., 0] > 0.1, sliding), h,
         ),
-        "mend_adjoint": ((direction, errors, 0 * errors, still, f, 1 / inertia, None, material, plan), h),
+        "adjoint_fallback": ((direction, errors, 0 * errors, still, f, 1 / inertia, None, material, plan), h),
     }  # fmt: skip
 
 
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "rollout_vjp", "conjugate_gradients_",
-    "adjoint_system", "contact_gradients", "adjoint_result", "mend_adjoint", "conjugate_gradients",
+    "adjoint_system", "contact_gradients", "adjoint_result", "adjoint_fallback", "conjugate_gradients",
 )  # fmt: skip

@@ -51,32 +51,35 @@ def test_op_is_the_cycle_of_its_tables(name: str, dtype: torch.dtype) -> None:
 
 
 @pytest.mark.parametrize("name", ["beam", "slivers", "bodies", "box"])
-def test_lifts_of_a_gpu_have_smoothing_in_them(name: str) -> None:
+def test_prolongation_of_a_gpu_includes_smoothing(name: str) -> None:
     """(I - S A) P, by rows and by nodes; everything else is as on a CPU."""
     case = {"beam": lambda: beam(1e6), "slivers": slivers, "bodies": many_bodies, "box": lambda: swing(13, 1e6)}[name]()
     sim = prepared(case)
     found, plain = (build_levels(sim, folded=folded) for folded in (True, False))
     for row, array in zip(MULTILEVEL_TABLE, sim.plan.arrays[len(PLAN_TABLE) :], strict=True):
         assert np.array_equal(plain[row.name], array.numpy()), row.name
-        if "lift" not in row.name and "node" not in row.name and row.name != "level_sizes":
+        if "prolongation" not in row.name and "node" not in row.name and row.name != "level_sizes":
             assert np.array_equal(found[row.name], plain[row.name]), row.name
     levels = Tables(sim.plan).levels
     assert len(levels) == (2 if name in ("bodies", "box") else 1)
-    for kind, height, (matrix, inverse, lift) in zip(("fine", "middle"), (1, 4), levels, strict=False):
+    for kind, height, (matrix, inverse, prolongation) in zip(("fine", "middle"), (1, 4), levels, strict=False):
         rng = np.random.default_rng(0)
-        below, above = (rng.standard_normal((count, 3)) for count in lift.shape[::-1])
-        t = {key: found[f"{kind}_{key}"] for key in ("lift_start", "lift_node", "lift_weight")}
-        t |= {key: found[f"{kind}_{key}"] for key in ("node_start", "node_row", "node_weight", "node_lift")}
-        rows = bsr_array((t["lift_weight"].reshape(-1, height, 4), t["lift_node"], t["lift_start"]), shape=lift.shape)
+        below, above = (rng.standard_normal((count, 3)) for count in prolongation.shape[::-1])
+        t = {key: found[f"{kind}_{key}"] for key in ("prolongation_start", "prolongation_node", "prolongation_weight")}
+        t |= {key: found[f"{kind}_{key}"] for key in ("node_start", "node_row", "node_weight", "node_prolongation")}
+        rows = bsr_array(
+            (t["prolongation_weight"].reshape(-1, height, 4), t["prolongation_node"], t["prolongation_start"]),
+            shape=prolongation.shape,
+        )
         weight = t["node_weight"].reshape(-1, height, 4).transpose(0, 2, 1)
-        nodes = bsr_array((weight, t["node_row"], t["node_start"]), shape=lift.shape[::-1])
-        image = lift @ below
+        nodes = bsr_array((weight, t["node_row"], t["node_start"]), shape=prolongation.shape[::-1])
+        image = prolongation @ below
         expected = image - Tables.smooth(matrix, inverse, matrix @ image)
         assert np.linalg.norm(rows @ below - expected) <= 1e-13 * np.linalg.norm(image)
-        smoothed = lift.T @ (above - matrix @ Tables.smooth(matrix, inverse, above))
-        assert np.linalg.norm(nodes @ above - smoothed) <= 1e-13 * np.linalg.norm(lift.T @ above)
-        assert len(t["node_lift"]) == 0
-        assert len(t["lift_node"]) == found["level_sizes"][{"fine": 1, "middle": 4}[kind]]
+        smoothed = prolongation.T @ (above - matrix @ Tables.smooth(matrix, inverse, above))
+        assert np.linalg.norm(nodes @ above - smoothed) <= 1e-13 * np.linalg.norm(prolongation.T @ above)
+        assert len(t["node_prolongation"]) == 0
+        assert len(t["prolongation_node"]) == found["level_sizes"][{"fine": 1, "middle": 4}[kind]]
 
 
 def test_a_direct_one_is_the_inverse(dtype: torch.dtype) -> None:
@@ -218,11 +221,11 @@ def test_arrays_are_those_of_the_table(dtype: torch.dtype) -> None:
             assert array.shape[1:] == ((row.width,) if row.width > 1 else ()), row.name
         sizes = plan.level_sizes.tolist()
         assert sizes[0] == len(plan.fine_column) == int(plan.fine_start[-1])
-        assert sizes[1] == len(plan.fine_lift_node) == int(plan.fine_node_start[-1])
+        assert sizes[1] == len(plan.fine_prolongation_node) == int(plan.fine_node_start[-1])
         assert sizes[2] == len(plan.fine_node_start) - 1
         middle = bool(sizes[5])
         assert sizes[3] == len(plan.middle_column)
-        assert sizes[4] == len(plan.middle_lift_node)
+        assert sizes[4] == len(plan.middle_prolongation_node)
         assert sizes[5] == (len(plan.middle_node_start) - 1 if middle else 0)
         moved = plan.to("meta")
         on_cpu = [row.name for row, array in zip(moved.table, moved.arrays, strict=True) if array.device.type == "cpu"]

@@ -190,7 +190,7 @@ def test_plans_are_checked(sim: pd.Simulator) -> None:
         ("tet_rest", plan.tet_rest[:-1], r"plan\.tet_rest .*got Float \[2, 96\] on cpu"),
         ("tet_corner", plan.tet_corner.int(), r"plan\.tet_corner must be Short"),
         ("slot_vertex", plan.slot_vertex[:-1], r"plan\.slot_vertex must be \[27\] \(internal vertex"),
-        ("vertex_group", plan.vertex_group[:-1], r"plan\.vertex_group must be \[27\]"),
+        ("vertex_component", plan.vertex_component[:-1], r"plan\.vertex_component must be \[27\]"),
         ("shared_slot", torch.zeros(1, dtype=torch.int32), r"plan\.shared_slot must be \[0\]"),
         ("vertex_order", plan.vertex_order.flip(0)[::2], r"plan\.vertex_order .*got strides \[2\]"),
     ]

@@ -303,11 +303,11 @@ def test_friction_that_jams_is_said() -> None:
     with pytest.warns(
         UserWarning, match=r"step with sliding friction is not solved in 1 of 2 environments .*1.0e-01.*jams"
     ):
-        found = torch.ops.torchpd.mend_adjoint(solution, solved, jams, *given, time_step=sim.time_step)
+        found = torch.ops.torchpd.adjoint_fallback(solution, solved, jams, *given, time_step=sim.time_step)
     assert torch.equal(found, solution)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        torch.ops.torchpd.mend_adjoint(solution, solved, solved, *given, time_step=sim.time_step)
+        torch.ops.torchpd.adjoint_fallback(solution, solved, solved, *given, time_step=sim.time_step)
 
 
 def test_without_friction_nothing_is_added() -> None:

@@ -156,14 +156,14 @@ def test_shared_vertices_list_all_their_slots_in_patch_order(plan: Plan) -> None
 def test_loose_pieces_are_numbered(plan: Plan, values: SceneValues) -> None:
     order = plan.vertex_order.numpy()
     group = np.empty(len(order), dtype=np.int64)
-    group[order] = plan.vertex_group.numpy()
+    group[order] = plan.vertex_component.numpy()
     hard = values.pin_vertices[np.isinf(values.pin_stiffness)]
     held = np.zeros(len(order), dtype=bool)
     for number in np.unique(values.component[hard]):
         points = values.rest_positions[hard[values.component[hard] == number]]
         held |= (values.component == number) & (np.linalg.matrix_rank(points - points[0]) > 1)
     np.testing.assert_array_equal(group < 0, held)
-    sizes = plan.group_size.numpy()
+    sizes = plan.component_size.numpy()
     np.testing.assert_array_equal(np.bincount(group[group >= 0], minlength=len(sizes)), sizes)
     for number in range(len(sizes)):
         assert len(np.unique(values.component[group == number])) == 1
@@ -230,7 +230,7 @@ def test_plan_to_keeps_integers(plan: Plan) -> None:
 def test_sizes_count_what_the_arrays_hold(plan: Plan, values: SceneValues) -> None:
     slots = plan.patch_slot.diff()
     assert plan.sizes.tolist() == [
-        len(values.rest_positions), len(values.tets), len(values.pin_vertices), len(plan.group_size),
+        len(values.rest_positions), len(values.tets), len(values.pin_vertices), len(plan.component_size),
         len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
         plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()),
     ]  # fmt: skip

@@ -246,12 +246,12 @@ def test_only_what_pins_clamp_everywhere_is_left_out() -> None:
     clamped = sim.plan
 
     def groups(plan: Plan) -> list[int]:
-        return plan.vertex_group[torch.argsort(plan.vertex_order)].reshape(2, -1).unique(dim=1).flatten().tolist()
+        return plan.vertex_component[torch.argsort(plan.vertex_order)].reshape(2, -1).unique(dim=1).flatten().tolist()
 
     assert groups(clamped) == [-1, -1]
     sim.set_material(pin_hard=torch.cat([torch.ones(9) > 0, torch.zeros(9) > 0]))
     assert groups(sim.plan) == [-1, 0]
-    assert sim.plan.sizes[3] == 1 == len(sim.plan.group_size)
+    assert sim.plan.sizes[3] == 1 == len(sim.plan.component_size)
     one = sim.plan
     sim.set_material(pin_hard=True)
     sim.set_material(pin_hard=torch.cat([torch.ones(9) > 0, torch.zeros(9) > 0]))

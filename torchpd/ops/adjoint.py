@@ -29,7 +29,7 @@ from .. import _C
 from ..common.warn import warn_user
 from .diagonal import named_material, pinned_vertices, step_diagonal
 
-__all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "is_recording", "mend_adjoint", "step_gradient"]
+__all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "adjoint_fallback", "is_recording", "step_gradient"]
 
 # see csrc/solver/adjoint/system.h
 ADJOINT_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_tolerance, strict=True))
@@ -101,7 +101,7 @@ def _warn_of_friction(failed: Tensor, error: Tensor) -> None:
     )
 
 
-def mend_adjoint(
+def adjoint_fallback(
     solution: Tensor,
     error: Tensor,
     friction: Tensor | None,

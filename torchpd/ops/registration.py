@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_leaves
 
 from .. import _C
 from ..common.tables import MATERIAL_TABLE
-from .adjoint import mend_adjoint
+from .adjoint import adjoint_fallback
 from .diagonal import named_material
 from .vmap import register_rule
 from .vmap_step import rollout_vjp_rule, step_vjp_rule
@@ -172,7 +172,7 @@ def _(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
     return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)
 
 
-@_register_fake("mend_adjoint")
+@_register_fake("adjoint_fallback")
 def _(solution: Tensor, *_: Any, **__: Any) -> Tensor:
     return solution.new_empty(solution.shape)
 
@@ -212,9 +212,9 @@ def _(matrices: Tensor, direction: Tensor) -> Tensor:
 # ---- kernels
 
 
-@torch.library.impl("torchpd::mend_adjoint", ("cpu", "cuda"))
+@torch.library.impl("torchpd::adjoint_fallback", ("cpu", "cuda"))
 def _(*args: Any, time_step: float) -> Tensor:
-    return mend_adjoint(*args, time_step=time_step)
+    return adjoint_fallback(*args, time_step=time_step)
 
 
 # ---- derivatives: each is another op

@@ -33,7 +33,7 @@ __all__ = [
 _WORTH_A_BAR = 200_000  # tetrahedra from which a progress bar is shown
 # in the order of their numbers in the `sizes` of a GPU plan
 KERNELS = ("block", "cluster", "grid", "stream")
-_SIZE_GROUPS = 3  # place in PlanSize of csrc/views/views.h
+_SIZE_COMPONENTS = 3  # place in PlanSize of csrc/views/views.h
 
 
 def kernel_of(arrays: Sequence[Tensor]) -> str:
@@ -171,10 +171,10 @@ def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
     """Copy of a CPU plan for another set of components that a step may move rigidly."""
     if plan.kernel is not None:
         raise ValueError("with_loose_components: plan must be a CPU plan, got a GPU plan; compile it again")
-    group, group_size = (tensor_of(array) for array in loose_pieces(values))
+    group, component_size = (tensor_of(array) for array in loose_pieces(values))
     sizes = plan.sizes.clone()
-    sizes[_SIZE_GROUPS] = len(group_size)
-    new = {"vertex_group": group[plan.vertex_order.long()], "group_size": group_size, "sizes": sizes}
+    sizes[_SIZE_COMPONENTS] = len(component_size)
+    new = {"vertex_component": group[plan.vertex_order.long()], "component_size": component_size, "sizes": sizes}
     arrays = tuple(new.get(row.name, array) for row, array in zip(plan.table, plan.arrays, strict=True))
     return replace(plan, arrays=arrays, loose=values.loose)
 
@@ -183,7 +183,7 @@ def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
     """Counts of a CPU plan, in the order of PlanSize in csrc/views/views.h."""
     slots = np.diff(arrays["patch_slot"])
     counts = (
-        len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), len(arrays["group_size"]),
+        len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), len(arrays["component_size"]),
         len(arrays["tet_order"]), len(slots), len(arrays["slot_vertex"]), len(arrays["shared_start"]) - 1, slots.max(),
     )  # fmt: skip
     return np.array(counts, dtype=np.int32)
@@ -218,9 +218,9 @@ def compile_plan(
             advance,
         )
     internal = internal_numbers(arrays["vertex_order"])
-    group, group_size = loose_pieces(values)
-    arrays["vertex_group"] = group[arrays["vertex_order"]]
-    arrays["group_size"] = group_size
+    group, component_size = loose_pieces(values)
+    arrays["vertex_component"] = group[arrays["vertex_order"]]
+    arrays["component_size"] = component_size
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
     arrays["sizes"] = _sizes(arrays, tets)
     tensors = (tensor_of(arrays[row.name]) for row in PLAN_TABLE)

@@ -83,7 +83,7 @@ def has_outliers(plan: Plan, material: Sequence[Tensor], time_step: float) -> bo
         return False
     # as in csrc/solver/multilevel/material_mismatch.h: a uniform growth of the material is no mismatch
     scale = torch.maximum(elements.max(), inertias.min())
-    return bool(inertias.max() > _C.known_inertia * scale)
+    return bool(inertias.max() > _C.outlier_ratio * scale)
 
 
 def precondition_plan(

@@ -10,30 +10,30 @@
 
 namespace pd::inline PD_TARGET {
 
-// What the elements of a plan keep of a place: nine numbers of a rotation, nine of its answer, blocks of lanes side by side.
+// The rotation Jacobian of every element: nine numbers of the rotation and nine of the inverse, in blocks of lanes.
 template <class T>
-class Turnings {
+class RotationJacobians {
   static constexpr int W = native_width<T>, numbers = 18;
 
  public:
-  explicit Turnings(const Plan<T>& plan)
+  explicit RotationJacobians(const Plan<T>& plan)
       : storage_(allocate_zeroed(std::int64_t(plan.blocks) * block_lanes * numbers * sizeof(T))),
         data_(reinterpret_cast<T*>(storage_.get())) {}
 
-  void set(const BlockPart<T>& part, const Turning<Pack<T, W>>& turning) {
-    each(part, turning, [](auto& number, T* at) { number.store(at); });
+  void set(const BlockPart<T>& part, const RotationJacobian<Pack<T, W>>& jacobian) {
+    each(part, jacobian, [](auto& number, T* at) { number.store(at); });
   }
-  Turning<Pack<T, W>> get(const BlockPart<T>& part) const {
-    Turning<Pack<T, W>> turning;
-    each(part, turning, [](auto& number, T* at) { number = Pack<T, W>::load(at); });
-    return turning;
+  RotationJacobian<Pack<T, W>> get(const BlockPart<T>& part) const {
+    RotationJacobian<Pack<T, W>> jacobian;
+    each(part, jacobian, [](auto& number, T* at) { number = Pack<T, W>::load(at); });
+    return jacobian;
   }
 
  private:
   template <class Any, class Visit>
-  void each(const BlockPart<T>& part, Any& turning, const Visit& visit) const {
+  void each(const BlockPart<T>& part, Any& jacobian, const Visit& visit) const {
     T* at = data_ + std::int64_t(part.block) * block_lanes * numbers + part.first_lane;
-    for (auto* matrix : {&turning.rotation, &turning.answer}) {
+    for (auto* matrix : {&jacobian.rotation, &jacobian.inverse}) {
       for (auto& row : matrix->row) {
         for (auto* number : {&row.x, &row.y, &row.z}) {
           visit(*number, at);
@@ -64,16 +64,16 @@ struct FrictionVectors {
   Storage storage_;
 };
 
-// What an environment is solved in, by all of a team.
+// Memory of one environment's solve, shared by a team.
 template <class T>
 struct ConjugateMemory {
   Workspace<Single<T>> vectors;
-  Turnings<T> turnings;
-  std::unique_ptr<Cycle<Single<T>>> cycle;  // of a plan with levels
+  RotationJacobians<T> jacobians;
+  std::unique_ptr<Cycle<Single<T>>> cycle;  // null without levels
   FrictionVectors<T> friction;
 
   explicit ConjugateMemory(const ConjugateCall<T>& call)
-      : vectors(call), turnings(call.plan), friction(call.friction ? call.plan.vertices : 0) {
+      : vectors(call), jacobians(call.plan), friction(call.friction ? call.plan.vertices : 0) {
     if (call.plan.levels.there()) cycle = std::make_unique<Cycle<Single<T>>>(call.plan.levels);
   }
 };
@@ -89,7 +89,7 @@ class ConjugatePass {
       : call_(call),
         plan_(call.plan),
         w_(work.vectors),
-        turnings_(work.turnings),
+        jacobians_(work.jacobians),
         cycle_(work.cycle.get()),
         f_(work.friction),
         team_(team),
@@ -120,7 +120,7 @@ class ConjugatePass {
     return to_quad(from[row(i)], from[row(i) + 1], from[row(i) + 2]);
   }
 
-  // Every thread finds it for itself.
+  // Every thread computes it for itself.
   void find_unit() {
     const std::int64_t count = 3 * std::int64_t(plan_.vertices);
     const T* residual = call_.residual + environment_ * count;
@@ -146,13 +146,14 @@ class ConjugatePass {
     team_.barrier();
     sweep_.set_origins();
     team_.barrier();
-    const auto turn = one_by_one([&](const auto& elements, int s) {
+    const auto differentiate = one_by_one([&](const auto& elements, int s) {
       using R = typename std::remove_cvref_t<decltype(elements)>::R;
       Vec3<R> x[4];
       elements.corners(s, 0, x);
-      turnings_.set(elements.part(s), Turning<R>(deformation_gradient(x, elements.rest(s))));
+      jacobians_.set(elements.part(s),
+                     RotationJacobian<R>(deformation_gradient(x, elements.rest(s))));
     });
-    sweep_.run(0, turn, [](std::int64_t, const Quad<T>&, Sum&) {});
+    sweep_.run(0, differentiate, [](std::int64_t, const Quad<T>&, Sum&) {});
   }
 
   void begin(Conjugate& numbers) {
@@ -160,7 +161,7 @@ class ConjugatePass {
     each_part([&](std::int64_t i, Sum& sums) {
       const Quad<T> right = residual()[i];
       direction()[i] = preconditioned_residual(i);
-      // zero, unless something is infinite or no number
+      // zero, unless a number is infinite or NaN
       const Quad<T> lost = multiply_add(T(0), w_.x[i], T(0) * right);
       sums.first = multiply_add(right, right, sums.first) + lost;
       sums.second = multiply_add(right, direction()[i], sums.second);
@@ -177,7 +178,7 @@ class ConjugatePass {
       using R = typename std::remove_cvref_t<decltype(elements)>::R;
       Vec3<R> dx[4], g[4];
       elements.corners(s, 1, dx);
-      solid_hessian_product(turnings_.get(elements.part(s)), dx, elements.rest(s),
+      solid_hessian_product(jacobians_.get(elements.part(s)), dx, elements.rest(s),
                             elements.weight(s), g);
       elements.add(s, g);
     });
@@ -202,18 +203,19 @@ class ConjugatePass {
       sums.second = multiply_add(rest, w_.inverse[i] * rest, sums.second);
     });
     const auto sum = total(1);
-    numbers.judge(sum.first, call_.tolerance);
+    numbers.check_residual(sum.first, call_.tolerance);
     if (!numbers.active) return;
-    const T keep = T(numbers.keep(cycle_ ? apply_levels() : sum.second));
+    const T keep = T(numbers.direction_ratio(cycle_ ? apply_levels() : sum.second));
     // not part by part: others may still read the sums
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       direction()[i] = multiply_add(keep, direction()[i], preconditioned_residual(i));
     team_.barrier();
   }
 
-  // Goes on with friction, after so many products; returns whether it has.
+  // Continues with BiCGStab where vertices slide, after so many products; returns whether it has.
   bool solve_friction(const Conjugate& numbers, int products) {
-    if (!call_.friction || !adds_friction(numbers, call_.tolerance) || !some_slide()) return false;
+    if (!call_.friction || !continues_with_friction(numbers, call_.tolerance) || !some_slide())
+      return false;
     FrictionSolve friction(nullptr, numbers.scale);
     friction.begin(products, adjoint_iterations);
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
@@ -223,7 +225,7 @@ class ConjugatePass {
     return true;
   }
 
-  // every thread looks for itself
+  // every thread checks for itself
   bool some_slide() const {
     for (std::int64_t i = 0; i < plan_.vertices; ++i) {
       if (slides(sliding(i))) return true;
@@ -241,7 +243,7 @@ class ConjugatePass {
       return w_.inverse[i] * (stage == FrictionStage::first ? f_.search : residual())[i];
     };
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
-      direction()[i] = Lanes::value(press(to_vec3(z(i)), sliding(i)));
+      direction()[i] = Lanes::value(transposed_friction(to_vec3(z(i)), sliding(i)));
     team_.barrier();
     multiply([&](std::int64_t i, const Quad<T>& force, Sum& sums) {
       const Quad<T> product =
@@ -263,7 +265,8 @@ class ConjugatePass {
     const auto sum = total(0);
     if (stage == FrictionStage::residual) return correct(friction, sum.first);
     const bool first = stage == FrictionStage::first;
-    const T step = T(first ? friction.go(sum.first) : friction.smooth(sum.first, sum.second));
+    const T step =
+        T(first ? friction.search_step(sum.first) : friction.residual_step(sum.first, sum.second));
     if (first && friction.stage == FrictionStage::residual) return;
     const Quad<T>* const product = first ? image() : f_.smoothed;
     each_part([&](std::int64_t i, Sum& sums) {
@@ -275,14 +278,14 @@ class ConjugatePass {
     });
     if (first) return;
     const auto left = total(1);
-    const T keep = T(friction.judge(left.first, left.second, call_.tolerance));
+    const T keep = T(friction.finish_iteration(left.first, left.second, call_.tolerance));
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       f_.search[i] =
           multiply_add(keep, subtract_product(f_.search[i], step, image()[i]), residual()[i]);
     team_.barrier();
   }
 
-  // With the true residual of y and its correction, by its |r|^2: begins a cycle, or ends.
+  // Takes the |r|^2 of the true residual of y with its correction: begins a cycle, or ends.
   void correct(FrictionSolve& friction, double square) {
     const bool enters = friction.accept(square, call_.tolerance);
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
@@ -293,7 +296,7 @@ class ConjugatePass {
     team_.barrier();
   }
 
-  // M of a field, for the result of the cycle
+  // Applies M to a field; the result stands in the cycle.
   void precondition(const Quad<T>* field) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       cycle_->input()[i] = field[i];
@@ -307,7 +310,7 @@ class ConjugatePass {
     team_.barrier();
   }
 
-  // M of the residual, for `preconditioned_residual`; returns r . M r
+  // Applies M to the residual, for `preconditioned_residual`; returns r . M r.
   double apply_levels() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       cycle_->input()[i] = residual()[i];
@@ -333,15 +336,16 @@ class ConjugatePass {
   const T* across(std::int64_t i) const {
     return call_.sliding ? sliding(i) + 3 * slide_across : nullptr;
   }
-  // of what contacts let through; null where all is
+  // on the free directions; null where all are free
   const T* projector(std::int64_t i) const {
     return call_.projector ? call_.projector + 3 * row(i) : nullptr;
   }
 
-  // `slides`: the multiplier is G^T of what was solved for
+  // `slides`: the multiplier is G^T times the solution
   void store(bool slides) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      if (slides) solution()[i] = Lanes::value(press(to_vec3(solution()[i]), sliding(i)));
+      if (slides)
+        solution()[i] = Lanes::value(transposed_friction(to_vec3(solution()[i]), sliding(i)));
       write(call_.solution, i, unit_ * solution()[i]);
       write(call_.residual, i, unit_ * residual()[i]);
       write(call_.direction, i, unit_ * direction()[i]);
@@ -351,7 +355,8 @@ class ConjugatePass {
     for (int c = 0; c < 3; ++c) to[row(i) + c] = a.q.v[c];
   }
 
-  // The vertices of every part of a sweep, whose sums are left as it leaves them: in one order however many threads there are.
+  // Visits the vertices of every part of a sweep and leaves the sums as a sweep does: in one order for any number of
+  // threads.
   template <class Visit>
   void each_part(const Visit& visit) {
     for (int part = team_.begin(w_.part_count); part < team_.end(w_.part_count); ++part) {
@@ -368,7 +373,7 @@ class ConjugatePass {
     team_.barrier();
   }
 
-  // every thread adds up the same parts in the same order, so all come to the same decisions
+  // every thread adds up the same parts in the same order, so all make the same decisions
   typename Workspace<Lanes>::Part total(int parity) const {
     typename Workspace<Lanes>::Part sum = w_.parts[parity][0];
     for (int part = 1; part < w_.part_count; ++part) {
@@ -378,7 +383,7 @@ class ConjugatePass {
     return sum;
   }
 
-  // the directions stand where a sweep looks for its second field
+  // the directions stand where a sweep reads its second field
   Quad<T>* direction() const { return w_.before; }
   Quad<T>* solution() const { return w_.velocity; }
   Quad<T>* residual() const { return w_.target; }
@@ -387,7 +392,7 @@ class ConjugatePass {
   const ConjugateCall<T>& call_;
   const Plan<T>& plan_;
   Workspace<Lanes>& w_;
-  Turnings<T>& turnings_;
+  RotationJacobians<T>& jacobians_;
   const Cycle<Lanes>* cycle_;
   FrictionVectors<T>& f_;
   const Team& team_;

@@ -49,7 +49,7 @@ class FieldPass {
     return to_quad(p[0], p[1], p[2]);
   }
 
-  // Positions relative to each patch's first vertex, and on top of them what they are displaced by, as in a step.
+  // Positions relative to each patch's first vertex, and displacements on top of them, as in a step.
   void load(std::int64_t environment) {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       if (call_.positions) w_.x[i] = read(call_.positions, environment, i);
@@ -100,7 +100,7 @@ class FieldPass {
     const auto rest = read_rest<R>([&](int number) { return R::load(part.rest(number)); });
     const R value = element(corner, rest, R::load(w_.weight + part.element()));
     for (int lane = 0; lane < W; ++lane) {
-      // padding repeats an element of the patch with no volume: it must not write
+      // padding repeats an element of the patch with zero volume: it must not write
       if (plan_.tet_volume[part.element() + lane] == T(0)) continue;
       call_.out[environment * plan_.tets + plan_.tet_order[part.element() + lane]] = value.v[lane];
     }

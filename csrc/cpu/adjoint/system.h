@@ -8,13 +8,13 @@
 
 namespace pd::inline PD_TARGET {
 
-// Threads for so many vertices.
+// Number of threads that pays off for so many vertices.
 inline int useful_threads(std::int64_t vertices, int threads) {
   constexpr std::int64_t least_share = 4096;
   return int(std::min<std::int64_t>(threads, vertices / least_share + 1));
 }
 
-// visit(vertex): all of them as if there were no pins, then those that have one.
+// visit(vertex): all vertices as if there were no pins, then the pinned ones.
 template <class T, class Visit>
 void each_adjoint_vertex(const AdjointSystemCall<T>& call, int threads, const Visit& visit) {
   const Plan<T>& plan = call.plan;
@@ -34,13 +34,13 @@ void each_adjoint_vertex(const AdjointSystemCall<T>& call, int threads, const Vi
 
 template <class T>
 void adjoint_system_any(const AdjointSystemCall<T>& call, int threads) {
-  each_adjoint_vertex(call, threads, [](const auto& vertex) { vertex.solve_for(); });
+  each_adjoint_vertex(call, threads, [](const auto& vertex) { vertex.write_system(); });
 }
 
 template <class T>
 void contact_gradients_any(const ContactGradientsCall<T>& call, int threads) {
   each_adjoint_vertex(call.step, threads,
-                      [&](const auto& vertex) { ContactGradients(call, vertex).give(); });
+                      [&](const auto& vertex) { ContactGradients(call, vertex).differentiate(); });
 }
 
 template <class T>
@@ -48,7 +48,7 @@ void adjoint_result_any(const AdjointResultCall<T>& call, int threads) {
   const std::int64_t count = call.batch * call.vertices;
   run_team(useful_threads(count, threads), [&](const Team& team) {
     for (std::int64_t n = team.begin(count); n < team.end(count); ++n)
-      AdjointAnswer<T>{call, n / call.vertices, n % call.vertices}.give();
+      AdjointResult<T>{call, n / call.vertices, n % call.vertices}.write();
   });
 }
 

@@ -1,7 +1,8 @@
-// L^-T (L^-1 r), symmetric and positive in any precision: the coarse solve of v_cycle.h. L^-1 stands row by row up to the diagonal.
+// L^-T (L^-1 r), symmetric and positive in any precision: the coarse solve of v_cycle.h. L^-1 is stored row by row up
+// to the diagonal.
 //
-// One environment and several get the same bits by the same operations in the same order: number j of a row goes to chain
-// j mod 4, whose sums are added up last; a column is one chain. Rows and columns differ in length, so threads take them in turn.
+// One environment and several get the same bits. Number j of a row goes to chain j mod 4, and chains are added up
+// last; a column is one chain. Rows and columns differ in length, so threads take them in turn.
 #pragma once
 #include "cpu/step/lanes.h"
 #include "solver/multilevel/lbfgs.h"
@@ -20,7 +21,7 @@ class Dense {
   using Value = typename Lanes::Value;
   static constexpr bool alone = Lanes::environments == 1;
 
-  // of one environment: whole quads of numbers, and the columns that a thread works on at once
+  // for one environment: numbers of a vector, quads in it, and columns that a thread works on at once
   static constexpr int width = std::max(native_width<T>, 4), quads = width / 4;
   static constexpr int strip = alone ? 2 * width : 8;
   using Wide = Pack<T, width>;
@@ -57,10 +58,10 @@ class Dense {
         sum[c] = multiply_add(Real(numbers[j + c]), x[j + c], sum[c]);
     }
     for (int c = 0; j + c <= i; ++c) sum[c] = multiply_add(Real(numbers[j + c]), x[j + c], sum[c]);
-    return join(sum);
+    return sum_chains(sum);
   }
 
-  // Rows i ... i + 3, i a multiple of four: up to number i a vector holds the chains of a row side by side.
+  // Rows i ... i + 3, i a multiple of four. Up to number i a vector holds the chains of a row side by side.
   void four_rows(int i, const Value* x, Value* out) const {
     constexpr int vectors = row_chains / quads;
     const int count = std::min(row_chains, size_ - i);
@@ -83,7 +84,7 @@ class Dense {
     }
   }
 
-  // Columns from `first` on. Below the triangle that they begin with, axis by axis in one environment.
+  // Columns from `first` on. One environment handles the rows below their first triangle axis by axis.
   void some_columns(int first, const Value* x, Value* out) const {
     const int columns = std::min(strip, size_ - first), end = first + columns;
     Value sum[strip] = {};
@@ -121,7 +122,7 @@ class Dense {
     for (int j = 0; j < strip; ++j) sum[j] = to_quad(number[0][j], number[1][j], number[2][j]);
   }
 
-  // each of the next numbers in a quad of its own
+  // each of the next numbers, repeated in a quad of its own
   static Wide four_times(const T* numbers) {
     using V [[maybe_unused]] = typename Wide::Vector;
 #if PD_VECTOR_BYTES == 64

@@ -1,13 +1,14 @@
-// Runner of measure_misfit (solver/multilevel/material_mismatch.h) on the CPU.
+// Runner of measure_mismatch (solver/multilevel/material_mismatch.h) on the CPU.
 #pragma once
 #include "solver/multilevel/material_mismatch.h"
 #include "threads/team.h"
 
 namespace pd::inline PD_TARGET {
 
-// `inertia(i)` is a of an internal vertex. The ranges do not depend on how the team shares the work.
+// Loops and reduction of the comparison over a team's threads. `inertia(i)` is a of an internal vertex. The ranges do
+// not depend on how the team shares the work.
 template <class T, class Inertia>
-struct MisfitRunner {
+struct MismatchRunner {
   const Plan<T>& plan;
   const Team& team;
   Range (*ranges)[ranges_count];  // one row a thread
@@ -24,7 +25,7 @@ struct MisfitRunner {
       visit(i, inertia(i));
   }
 
-  void meet(Range (&range)[ranges_count]) const {
+  void reduce(Range (&range)[ranges_count]) const {
     for (int n = 0; n < ranges_count; ++n) ranges[team.rank][n] = range[n];
     team.barrier();
     for (int rank = 0; rank < team.size; ++rank) {

@@ -1,4 +1,4 @@
-// Runner of solver/multilevel/lbfgs.h on the CPU: what Stepper does of a step, and another way to the next iterate.
+// Runner of solver/multilevel/lbfgs.h on the CPU: a Stepper with other iterations.
 #pragma once
 #include "cpu/multilevel/deflation.h"
 #include "cpu/multilevel/material_mismatch.h"
@@ -10,16 +10,16 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: see solver/vertex.h.
-template <class Lanes, bool Touching>
-class MultilevelStepper : public Stepper<Lanes, Touching> {
-  using Base = Stepper<Lanes, Touching>;
+// `HasContacts`: see solver/vertex.h.
+template <class Lanes, bool HasContacts>
+class MultilevelStepper : public Stepper<Lanes, HasContacts> {
+  using Base = Stepper<Lanes, HasContacts>;
   using T = typename Lanes::Scalar;
   using Real = typename Lanes::Real;
   using Value = typename Lanes::Value;
   using Wide = typename Lanes::Wide;
   using Sum = Sums<Lanes>;
-  using Work = OuterWork<Lanes>;
+  using Work = MultilevelWork<Lanes>;
   static constexpr int width = Lanes::environments, dots = Work::dots;
   using Base::call_, Base::contacts_, Base::done_, Base::in_, Base::plan_, Base::schedule_,
       Base::set_, Base::sweep_, Base::team_, Base::used_, Base::vertex, Base::w_;
@@ -34,15 +34,15 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
         corotation_(plan_, team, work, outer.corotation) {}
 
   // All steps of the call, with a record every `set_.every`.
-  void roll() {
+  void rollout() {
     this->load();
-    this->weigh();
+    this->assemble_diagonal();
     compare_with_reference();
     for (int t = 0; t < set_.steps; ++t) {
       multilevel_step(*this);
       if (this->is_ended()) return;
       if ((t + 1) % set_.every == 0) this->store((t + 1) / set_.every - 1);
-      this->move_balls();
+      this->move_spheres();
     }
   }
 
@@ -52,88 +52,89 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     corotated_ = false;
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
-      const bool rough = Lanes::lane(friction, lane) > 0;
-      outer_[lane].begin(misfit_[lane], Touching, rough, corotates_, energy_noise<T>(),
-                         this->stop_[lane].fall);
+      const bool has_friction = Lanes::lane(friction, lane) > 0;
+      search_[lane].begin(mismatch_[lane], HasContacts, has_friction, corotates_, energy_noise<T>(),
+                          this->stop_[lane].free_fall);
       pairs_[lane] = {};
       made_[lane] = doubted_[lane] = 0;
       has_[lane] = holds_[lane] = false;
       if (corotates_) corotation_.forget(lane);
-      schedule_[lane].rho = misfit_[lane].spread;
+      schedule_[lane].rho = mismatch_[lane].spread;
     }
   }
 
-  void descend() { multilevel_iterations(*this, set_); }
+  void minimise() { multilevel_iterations(*this, set_); }
 
-  // E and what is out of balance at the trial u
+  // E and the residual at the trial u
   void evaluate(int k) {
     sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
       const auto v = vertex(i);
       sums.energy = v.add_energy(w_.u[i], sums.energy);
-      o_.fresh[i] = v.unbalanced(contacts_, w_.u[i], force);
-      if constexpr (Touching) {
-        const auto left = v.leeway(contacts_, w_.u[i], force);
-        o_.fresh_free[i] = left.free;
-        o_.fresh_friction[i] = v.friction(left.taken);
-        o_.fresh_gradient[i] = v.gradient(w_.u[i], force);
-        // work against the friction of the base
-        sums.first = multiply_add(o_.friction[i], w_.u[i] - o_.base[i], sums.first);
+      o_.trial_residual[i] = v.residual(contacts_, w_.u[i], force);
+      if constexpr (HasContacts) {
+        const auto free_directions = v.contact_projector(contacts_, w_.u[i], force);
+        o_.trial_free[i] = free_directions.free;
+        o_.trial_friction[i] = v.friction_force(free_directions.slip);
+        o_.trial_gradient[i] = v.gradient(w_.u[i], force);
+        // work against the friction at the iterate
+        sums.first = multiply_add(o_.friction[i], w_.u[i] - o_.iterate[i], sums.first);
       }
     });
   }
 
   // every thread decides from the same sums, so all decide alike
-  void judge(int k) {
+  void accept_or_reject(int k) {
     const auto sum = this->total(k & 1);
     for (int lane = 0; lane < width; ++lane) {
       if (done_[lane]) {
         Lanes::set_lane(accepted_, lane, T(0));
-        // what moves on in its lane has no part in sums either
+        // a finished lane must not enter sums either
         Lanes::set_lane(finite_, lane, T(0));
         continue;
       }
-      const double work = outer_[lane].known ? Lanes::lane(sum.first, lane) : 0;
+      const double work = search_[lane].known ? Lanes::lane(sum.first, lane) : 0;
       const double energy = Lanes::lane(sum.energy, lane) + work;
-      const bool accepted = outer_[lane].accept(energy, work, lbfgs_);
+      const bool accepted = search_[lane].accept(energy, work, lbfgs_);
       Lanes::set_lane(accepted_, lane, T(accepted ? 1 : 0));
       Lanes::set_lane(finite_, lane, T(energy < HUGE_VAL ? 1 : 0));
     }
   }
 
-  // The pair from the base to the trial, kept or not: it holds for the curvature on the way. Then the base moves on.
-  void learn(int k) {
+  // The secant pair from the iterate to the trial, accepted or not: it holds the curvature in between. Then the
+  // iterate moves.
+  void update_pairs(int k) {
     newest_ = (newest_ + 1) % history;
     iteration_ = k;
     pass([&](std::int64_t i, Value(&sum)[dots]) {
       if (k == 0) {
-        o_.base[i] = w_.u[i];
-        o_.pull[i] = o_.fresh[i];
+        o_.iterate[i] = w_.u[i];
+        o_.residual[i] = o_.trial_residual[i];
       }
-      const Value change = w_.u[i] - o_.base[i];
-      // directions are those of another step at first
+      const Value change = w_.u[i] - o_.iterate[i];
+      // at first the directions are those of another step
       const Value s = k == 0 ? none_ : restricted(i, change);
-      const Value y = k == 0 ? none_ : restricted(i, o_.fresh[i] - o_.pull[i]);
-      if constexpr (Touching) {
+      const Value y = k == 0 ? none_ : restricted(i, o_.trial_residual[i] - o_.residual[i]);
+      if constexpr (HasContacts) {
         for (int a = 0; corotates_ && a < 3; ++a) {
-          const Value d = Lanes::value(o_.fresh_free[i].row[a]) - Lanes::value(o_.free[i].row[a]);
+          const Value d = Lanes::value(o_.trial_free[i].row[a]) - Lanes::value(o_.free[i].row[a]);
           sum[2 * history + 3] = multiply_add(d, d, sum[2 * history + 3]);
         }
         keep_directions(i);
       }
-      // what momentum goes on along
-      w_.before[i] = choose(o_.base[i], w_.before[i]);
-      o_.base[i] = choose(w_.u[i], o_.base[i]);
-      o_.pull[i] = choose(o_.fresh[i], o_.pull[i]);
+      // the previous iterate, for momentum
+      w_.before[i] = choose(o_.iterate[i], w_.before[i]);
+      o_.iterate[i] = choose(w_.u[i], o_.iterate[i]);
+      o_.residual[i] = choose(o_.trial_residual[i], o_.residual[i]);
       sum[2 * history] = multiply_add(change, change, sum[2 * history]);
       if (set_.tolerance > 0) {
-        const Value way = w_.u[i] - w_.target[i];
-        sum[2 * history + 1] = multiply_add(way, way, sum[2 * history + 1]);
+        const Value displacement = w_.u[i] - w_.target[i];
+        sum[2 * history + 1] = multiply_add(displacement, displacement, sum[2 * history + 1]);
       }
       if (!lbfgs_) return;
-      // what is no number must not poison sums in which it has no part, those of the next environment among them
+      // a NaN must not poison sums that it has no part in, such as those of the next environment
       o_.s[newest_][i] = pick(finite_, numbers(s), none_);
       o_.y[newest_][i] = pick(finite_, numbers(y), none_);
-      const Value g = restricted(i, o_.pull[i]);
+      const Value g = restricted(i, o_.residual[i]);
       for (int j = 0; j < history; ++j) {
         sum[j] = multiply_add(o_.s[j][i], y, sum[j]);
         sum[history + j] = multiply_add(o_.s[j][i], g, sum[history + j]);
@@ -143,42 +144,42 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     double total[dots];
     for (int lane = 0; lane < width; ++lane) {
       add_up(lane, total);
-      outer_[lane].walk(total[2 * history]);
-      if (outer_[lane].accepted && !(total[2 * history + 3] == 0)) holds_[lane] = false;
+      search_[lane].add_path(total[2 * history]);
+      if (search_[lane].accepted && !(total[2 * history + 3] == 0)) holds_[lane] = false;
       stop(lane, k, total[2 * history], total[2 * history + 1]);
       if (!lbfgs_) continue;
-      Pairs& pairs = pairs_[lane];
+      SecantPairs& pairs = pairs_[lane];
       for (int j = 0; j < history; ++j) {
         pairs.product[j][newest_] = total[j];
-        pairs.pulled[j] = total[history + j];
+        pairs.s_dot_g[j] = total[history + j];
       }
-      const bool teaches = k > 0 && outer_[lane].teaches();
+      const bool teaches = k > 0 && search_[lane].updates_pairs();
       pairs.admit(newest_, teaches, total[2 * history], total[2 * history + 2]);
-      if (outer_[lane].forgets()) pairs.clear();
+      if (search_[lane].clears_pairs()) pairs.clear();
       pairs.first_loop(newest_);
     }
     team_.barrier();
   }
 
-  // whether no lane asks for M
-  bool goes_by_diagonal() const {
-    const auto without = [&](int lane) { return done_[lane] || outer_[lane].diagonal; };
+  // whether no lane needs M
+  bool uses_jacobi() const {
+    const auto without = [&](int lane) { return done_[lane] || search_[lane].jacobi; };
     for (int lane = 0; lane < width; ++lane)
       if (!without(lane)) return false;
     return lbfgs_;
   }
 
-  // direction = theta M g, corrected by the pairs; contacts and what M does not know go by the diagonal
+  // direction = theta M g, corrected by secant pairs; the diagonal serves blocked directions and outliers
   void precondition() {
     if (corotates_) corotate(iteration_);
     Real alpha[history] = {}, scale;
     for (int lane = 0; lane < width; ++lane) {
       for (int j = 0; j < history; ++j) Lanes::set_lane(alpha[j], lane, T(pairs_[lane].alpha[j]));
-      Lanes::set_lane(scale, lane, T(outer_[lane].weight(set_.relaxation, is_held(lane))));
+      Lanes::set_lane(scale, lane, T(search_[lane].weight(set_.relaxation, is_held(lane))));
     }
     Value* in = o_.cycle.input();
     each_vertex([&](std::int64_t i) {
-      Value q = restricted(i, o_.pull[i]);
+      Value q = restricted(i, o_.residual[i]);
       if (lbfgs_) {
         for (int j = 0; j < history; ++j) q = subtract_product(q, alpha[j], o_.y[j][i]);
         q = restricted(i, q);
@@ -194,20 +195,21 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     each_vertex([&](std::int64_t i) { o_.direction[i] = o_.cycle.result()[i]; });
   }
 
-  // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi iteration
-  void advance() {
+  // next trial: u + beta (u - before) - (1 + beta) t d out of the contacts, or a plain or accelerated Jacobi
+  // iteration
+  void next_trial() {
     Real beta, length, fallback, diagonal;
     bool some_fallback = false;
     for (int lane = 0; lane < width; ++lane) {
-      Outer& outer = outer_[lane];
-      const bool goes = !done_[lane], falls_back = goes && (outer.plain || outer.diagonal);
-      const double b = goes ? outer.send(schedule_[lane].limit, lbfgs_, has_[lane],
-                                         corotates_ && made_[lane] == 0, is_held(lane))
+      LineSearch& search = search_[lane];
+      const bool goes = !done_[lane], falls_back = goes && (search.plain_jacobi || search.jacobi);
+      const double b = goes ? search.propose(schedule_[lane].limit, lbfgs_, has_[lane],
+                                             corotates_ && made_[lane] == 0, is_held(lane))
                             : 0;
       Lanes::set_lane(beta, lane, T(b));
-      Lanes::set_lane(length, lane, T(goes ? (1 + b) * outer.length() : 0));
+      Lanes::set_lane(length, lane, T(goes ? (1 + b) * search.trial_length() : 0));
       Lanes::set_lane(fallback, lane, T(falls_back ? 1 : 0));
-      Lanes::set_lane(diagonal, lane, T(outer.accelerates() ? 1 : 0));
+      Lanes::set_lane(diagonal, lane, T(search.accelerates() ? 1 : 0));
       some_fallback = some_fallback || falls_back;
       used_[lane] += goes ? 1 : 0;
     }
@@ -216,7 +218,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       const auto v = vertex(i);
       const auto at = trial_vertex(v, i);
       const Value before = w_.before[i];
-      const Value& slope = Touching ? o_.gradient[i] : o_.pull[i];
+      const Value& slope = HasContacts ? o_.gradient[i] : o_.residual[i];
       Value next = at.step(contacts_, before, slope, o_.direction[i], length, beta);
       if (some_fallback)
         next = pick(fallback,
@@ -226,63 +228,63 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     });
   }
 
-  // the last trial counts only if it is better than the base, and that only if its energy is a number
-  void settle() {
+  // the result is the last trial if accepted, else the iterate; NaN if even its energy is NaN
+  void keep_best() {
     Real lost;
     for (int lane = 0; lane < width; ++lane)
-      Lanes::set_lane(lost, lane, outer_[lane].energy < HUGE_VAL ? T(0) : T(NAN));
+      Lanes::set_lane(lost, lane, search_[lane].energy < HUGE_VAL ? T(0) : T(NAN));
     const Value none = Lanes::value({lost, lost, lost});
-    each_vertex([&](std::int64_t i) { w_.u[i] = choose(w_.u[i], o_.base[i]) + none; });
-    for (int lane = 0; lane < width; ++lane) schedule_[lane].restarts = outer_[lane].restarts;
+    each_vertex([&](std::int64_t i) { w_.u[i] = choose(w_.u[i], o_.iterate[i]) + none; });
+    for (int lane = 0; lane < width; ++lane) schedule_[lane].restarts = search_[lane].restarts;
   }
 
  private:
-  // whether contacts are in the small problem
+  // whether the coarse problem includes contacts
   bool is_held(int lane) const {
-    if constexpr (!Touching) return false;
+    if constexpr (!HasContacts) return false;
     return made_[lane] > 0 && corotation_.is_held(lane);
   }
 
-  // The lanes whose small problem is made at iteration k, of where they stand.
+  // Builds the coarse problem of the lanes that need it at iteration k, at their iterates.
   void corotate(int k) {
     bool asks[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
-      Outer& outer = outer_[lane];
-      const TurningPlan plan(k, made_[lane], outer.restarts - doubted_[lane], Touching,
-                             outer.turns());
+      LineSearch& search = search_[lane];
+      const TurningPlan plan(k, made_[lane], search.restarts - doubted_[lane], HasContacts,
+                             search.rebuilds_coarse());
       asks[lane] = false;
-      // alone it would not have come here
-      if (outer.diagonal) continue;
+      // alone this lane would not be here
+      if (search.jacobi) continue;
       asks[lane] = !done_[lane] && plan.make;
       some = some || asks[lane];
       if (plan.forget) corotation_.forget(lane);
       has_[lane] = asks[lane] || (has_[lane] && !plan.forget);
       if (!asks[lane]) continue;
       ++made_[lane];
-      doubted_[lane] = outer.restarts;
-      outer.strayed = 0;
+      doubted_[lane] = search.restarts;
+      search.path_since_coarse = 0;
       holds_[lane] = false;
     }
     double scales[width];
-    for (int lane = 0; lane < width; ++lane) scales[lane] = outer_[lane].scale;
-    if (some) corotation_.make(o_.base, asks, scales);
+    for (int lane = 0; lane < width; ++lane) scales[lane] = search_[lane].scale;
+    if (some) corotation_.make(o_.iterate, asks, scales);
     corotated_ = std::any_of(has_, has_ + width, [](bool has) { return has; });
-    if constexpr (Touching) {
+    if constexpr (HasContacts) {
       bool holds[width];
       for (int lane = 0; lane < width; ++lane) {
-        holds[lane] = has_[lane] && !holds_[lane] && !done_[lane] && !outer_[lane].diagonal;
+        holds[lane] = has_[lane] && !holds_[lane] && !done_[lane] && !search_[lane].jacobi;
         holds_[lane] = holds_[lane] || holds[lane];
       }
       if (corotated_) corotation_.hold(o_.free, holds, scales);
     }
   }
 
-  // the cycle, and what the small problem gives, around it where something holds vertices that M has free
+  // the cycle with the coarse problem, which encloses it where contacts or outliers hold vertices that M leaves free
   void run_corotated(const Real& scale) {
     Value *in = o_.cycle.input(), *z = o_.cycle.result();
     bool around[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
-      around[lane] = !plan_.levels.direct && (Touching || misfit_[lane].strangers);
+      around[lane] = !plan_.levels.direct && (HasContacts || mismatch_[lane].has_outliers);
       some = some || around[lane];
     }
     corotation_.measure(in, around);
@@ -292,10 +294,10 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     each_vertex([&](std::int64_t i) { z[i] = corotation_.with(i, z[i]); });
   }
 
-  // where the lane accepted its trial `a`, else `b`
+  // `a` where the lane accepted its trial, else `b`
   Value choose(const Value& a, const Value& b) const { return pick(accepted_, a, b); }
 
-  // 0 for what is infinite or NaN
+  // 0 for infinity and NaN
   static Value numbers(const Value& a) {
     const auto number = [](const Real& x) {
       return select(lesser(x, -x) > Real(T(-HUGE_VAL)), x, Real(T(0)));
@@ -334,21 +336,21 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     }
   }
 
-  // from the base
-  TrialVertex<Lanes, Touching> trial_vertex(const Vertex<Lanes, Touching>& v,
-                                            std::int64_t i) const {
-    return {v, o_.base[i], o_.pull[i], o_.free + i, plan_.levels, i, outliers_};
+  // from the iterate
+  TrialVertex<Lanes, HasContacts> trial_vertex(const Vertex<Lanes, HasContacts>& v,
+                                               std::int64_t i) const {
+    return {v, o_.iterate[i], o_.residual[i], o_.free + i, plan_.levels, i, outliers_};
   }
   Value restricted(std::int64_t i, const Value& field) const {
     return trial_vertex(vertex(i), i).restricted(field);
   }
 
   void keep_directions(std::int64_t i) {
-    o_.gradient[i] = choose(o_.fresh_gradient[i], o_.gradient[i]);
-    o_.friction[i] = choose(o_.fresh_friction[i], o_.friction[i]);
+    o_.gradient[i] = choose(o_.trial_gradient[i], o_.gradient[i]);
+    o_.friction[i] = choose(o_.trial_friction[i], o_.friction[i]);
     for (int a = 0; a < 3; ++a) {
       o_.free[i].row[a] = Lanes::vec3(
-          choose(Lanes::value(o_.fresh_free[i].row[a]), Lanes::value(o_.free[i].row[a])));
+          choose(Lanes::value(o_.trial_free[i].row[a]), Lanes::value(o_.free[i].row[a])));
     }
   }
 
@@ -358,7 +360,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     pass([&](std::int64_t i, Value(&sum)[dots]) {
       for (int j = 0; j < history; ++j) sum[j] = multiply_add(o_.y[j][i], z[i], sum[j]);
       const Value d = trial_vertex(vertex(i), i).completed(z[i]);
-      sum[history] = multiply_add(o_.pull[i], d, sum[history]);
+      sum[history] = multiply_add(o_.residual[i], d, sum[history]);
     });
     double total[dots], with[history], c[history];
     Real factor[history];
@@ -368,7 +370,7 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
       pairs_[lane].second_loop(newest_, with, c);
       for (int j = 0; j < history; ++j) Lanes::set_lane(factor[j], lane, T(c[j]));
       const double slope = pairs_[lane].slope(total[history], c);
-      if (!done_[lane] && !outer_[lane].descends(slope)) pairs_[lane].clear();
+      if (!done_[lane] && !search_[lane].descends(slope)) pairs_[lane].clear();
     }
     each_vertex([&](std::int64_t i) {
       Value d = z[i];
@@ -377,23 +379,23 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
     });
   }
 
-  // The soft stop of an environment, by a trial that it went on from, or went back from: at rest rounding decides which.
-  void stop(int lane, int k, double change, double way) {
+  // The stopping test of an environment. A rejected trial counts too: at rest rounding decides which trials are.
+  void stop(int lane, int k, double change, double displacement) {
     if (!(set_.tolerance > 0) || k == 0 || done_[lane]) return;
-    done_[lane] = outer_[lane].ends(set_.tolerance, schedule_[lane], change, way);
+    done_[lane] = search_[lane].is_met(set_.tolerance, schedule_[lane], change, displacement);
   }
 
-  // how far the material is from that of M, per lane
+  // the material mismatch of each lane
   void compare_with_reference() {
     for (int lane = 0; lane < width; ++lane) {
       const auto inertia = [&](std::int64_t i) {
         return Lanes::lane(Lanes::widen(w_.inertia[i]), lane);
       };
-      MisfitRunner<T, decltype(inertia)> run{plan_, team_, o_.ranges, inertia};
-      misfit_[lane] =
-          measure_misfit(run, plan_.levels, call_.material.stiffness.of(in_.environment(lane)));
-      Lanes::set_lane(outliers_.trusted, lane, T(misfit_[lane].trusted));
-      outliers_.some = outliers_.some || misfit_[lane].strangers;
+      MismatchRunner<T, decltype(inertia)> run{plan_, team_, o_.ranges, inertia};
+      mismatch_[lane] =
+          measure_mismatch(run, plan_.levels, call_.material.stiffness.of(in_.environment(lane)));
+      Lanes::set_lane(outliers_.trusted, lane, T(mismatch_[lane].trusted));
+      outliers_.some = outliers_.some || mismatch_[lane].has_outliers;
     }
   }
 
@@ -401,15 +403,15 @@ class MultilevelStepper : public Stepper<Lanes, Touching> {
   bool lbfgs_, corotates_, corotated_ = false;
   Outliers<Real> outliers_{false, Real(T(1))};  // in any lane
   int newest_ = 0, iteration_ = 0;
-  bool has_[width] = {};                        // a small problem
-  bool holds_[width] = {};                      // and in it what contacts hold at the base
-  int made_[width] = {}, doubted_[width] = {};  // times, and failed trials by then
+  bool has_[width] = {};                        // the lane has a coarse problem
+  bool holds_[width] = {};                      // includes the contacts at the iterate
+  int made_[width] = {}, doubted_[width] = {};  // coarse problems built, and failed trials by then
   Corotation<Lanes> corotation_;
   Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});
   Real accepted_{T(1)}, finite_{T(1)};
-  Misfit misfit_[width];
-  Outer outer_[width];
-  Pairs pairs_[width];
+  MaterialMismatch mismatch_[width];
+  LineSearch search_[width];
+  SecantPairs pairs_[width];
 };
 
 }  // namespace pd::inline PD_TARGET

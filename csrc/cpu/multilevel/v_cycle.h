@@ -1,4 +1,5 @@
-// The preconditioner M of solver/multilevel/lbfgs.h on the CPU: one V-cycle, or a direct solve, by a team of threads, in a fixed order of sums.
+// The preconditioner M of solver/multilevel/lbfgs.h on the CPU: one V-cycle, or a direct solve, by a team of threads. The
+// order of sums is fixed.
 #pragma once
 #include "cpu/multilevel/dense_solve.h"
 #include "cpu/step/workspace.h"
@@ -13,7 +14,7 @@ class Cycle {
   using Real = typename Lanes::Real;
   using Value = typename Lanes::Value;
 
-  // right side, result, and two to work with
+  // right side, result, residual and work vector
   struct Fields {
     Value *in, *z, *rest, *part;
   };
@@ -37,10 +38,10 @@ class Cycle {
   Value* input() const { return fine_.in; }
   Value* result() const { return fine_.z; }
 
-  // result = M input. All of the team; the input has to be complete, the result is when this returns.
+  // result = M input, by the whole team. The input has to be complete; the result is complete on return.
   void run(const Team& team) const {
     if (levels_.direct) {
-      // what is held has no part in a product, be it NaN
+      // held vertices must not enter a product, since they may be NaN
       each_row(team, fine_level(levels_), [&](int row, std::int64_t) {
         if (!(levels_.fine_inverse[row] > T(0))) fine_.in[row] = {};
       });
@@ -66,7 +67,7 @@ class Cycle {
     team.barrier();
   }
 
-  // smooth, correct by what `below` makes of the restricted rest, smooth
+  // smooth, correct by the `below` level's solution for the restricted residual, smooth
   template <int B, class Below>
   static void descend(const Team& team, const Level<B, T>& level, const Fields& f, Value* below_in,
                       const Value* below_out, const Below& below) {
@@ -90,7 +91,7 @@ class Cycle {
     each_row(team, level, [&](int row, std::int64_t at) {
       Value sum[B];
       for (int i = 0; i < B; ++i) sum[i] = f.z[at + i];
-      add_lift<Real>(level, below_out, row, sum);
+      add_prolongation<Real>(level, below_out, row, sum);
       for (int i = 0; i < B; ++i) f.z[at + i] = sum[i];
     });
     each_row(team, level, [&](int row, std::int64_t at) {

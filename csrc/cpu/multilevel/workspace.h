@@ -1,4 +1,4 @@
-// Memory of the multilevel solver's outer iteration.
+// Memory of the multilevel solver's iterations.
 #pragma once
 #include "cpu/multilevel/deflation_workspace.h"
 #include "cpu/multilevel/v_cycle.h"
@@ -6,46 +6,49 @@
 
 namespace pd::inline PD_TARGET {
 
-// Vectors of the outer iteration, beside those of a Workspace, in which u is the trial.
+// Vectors of the multilevel iterations, beside those of a Workspace, whose u is the trial.
 template <class Lanes>
-struct OuterWork {
+struct MultilevelWork {
   using Real = typename Lanes::Real;
   using Value = typename Lanes::Value;
   using Wide = typename Lanes::Wide;
 
-  static constexpr int dots = 2 * history + 4;  // sums that one pass may make
-  static constexpr int chunk = 256;             // vertices that one of them covers
+  static constexpr int dots = 2 * history + 4;  // sums of one pass
+  static constexpr int chunk = 256;             // vertices in one partial sum
 
   Cycle<Lanes> cycle;
   CorotationWork<Lanes> corotation;
-  Value *base, *pull, *fresh,
-      *direction;  // [vertices] iterate to go on from, residuals there and at the trial
+  Value *iterate, *residual, *trial_residual,
+      *direction;  // [vertices] iterate, residual there, residual at the trial, direction
   Value *s[history], *y[history];  // [vertices] L-BFGS pairs
-  Mat3<Real>*free, *fresh_free;  // [vertices] directions that contacts leave; none without contacts
-  // [vertices] dE/du with what contacts balance, and their friction; none without contacts
-  Value *gradient, *fresh_gradient, *friction, *fresh_friction;
+  Mat3<Real>*free,
+      *trial_free;  // [vertices] projectors on the free directions; null without contacts
+  // [vertices] dE/du without the contacts' reaction, and friction; null without contacts
+  Value *gradient, *trial_gradient, *friction, *trial_friction;
   Wide (*sums)[dots];             // [chunks]
-  Range (*ranges)[ranges_count];  // [threads] of the material to that of M
+  Range (*ranges)[ranges_count];  // [threads] ratios of the material to that of M
   int chunks;
 
-  OuterWork(const StepCall<typename Lanes::Scalar>& call, bool touching, int threads)
+  MultilevelWork(const StepCall<typename Lanes::Scalar>& call, bool has_contacts, int threads)
       : cycle(call.plan.levels),
-        corotation(call.plan, call.settings.schedule == ScheduleKind::corotated, touching, threads),
+        corotation(call.plan, call.settings.schedule == ScheduleKind::corotated, has_contacts,
+                   threads),
         chunks((call.plan.vertices + chunk - 1) / chunk) {
     const bool pairs = call.settings.learns();
-    const std::int64_t n = call.plan.vertices, held = touching ? n : 0;
+    const std::int64_t n = call.plan.vertices, held = has_contacts ? n : 0;
     const std::int64_t vectors = 4 * n + 4 * held + (pairs ? 2 * history * n : 0);
     storage_ = allocate_zeroed(vectors * sizeof(Value) + 2 * held * sizeof(Mat3<Real>) +
                                chunks * sizeof(*sums) + threads * sizeof(*ranges) + 4 * alignment);
     std::byte* at = storage_.get();
-    for (Value** field : {&base, &pull, &fresh, &direction}) *field = place<Value>(at, n);
+    for (Value** field : {&iterate, &residual, &trial_residual, &direction})
+      *field = place<Value>(at, n);
     for (int i = 0; i < history; ++i) {
       s[i] = place<Value>(at, pairs ? n : 0);
       y[i] = place<Value>(at, pairs ? n : 0);
     }
-    for (Value** field : {&gradient, &fresh_gradient, &friction, &fresh_friction})
+    for (Value** field : {&gradient, &trial_gradient, &friction, &trial_friction})
       *field = place<Value>(at, held);
-    for (Mat3<Real>** field : {&free, &fresh_free}) *field = place<Mat3<Real>>(at, held);
+    for (Mat3<Real>** field : {&free, &trial_free}) *field = place<Mat3<Real>>(at, held);
     sums = place<Wide[dots]>(at, chunks);
     ranges = place<Range[ranges_count]>(at, threads);
   }

@@ -1,4 +1,4 @@
-// Element work of one patch: corners in, forces on the slots of the patch out, in a fixed order.
+// Elements of one patch: reads corners, adds forces to the patch's slots in a fixed order.
 #pragma once
 #include "cpu/step/lanes.h"
 #include "elements/solid_pair.h"
@@ -25,7 +25,7 @@ PD_HD FaceRest<R, 1> read_rest(Read read) {
   return {read(0), read(1), read(2), {{read(3), read(4), read(5)}}};
 }
 
-// Corner of W elements, from vertices stored as quads: loads and shuffles beat the gather instructions.
+// A corner of W elements, from vertices stored as quads: loads and shuffles beat the gather instructions.
 template <class T, int W>
 PD_HD Vec3<Pack<T, W>> gather_corner(const Quad<T>* x, const int16* slot) {
 #if PD_VECTOR_BYTES == 64
@@ -122,7 +122,7 @@ PD_HD void store_quads(const Vec3<Pack<T, W>>& a, Quad<T> (&quads)[W]) {
     quads[lane] = to_quad(T(a.x.v[lane]), T(a.y.v[lane]), T(a.z.v[lane]));
 }
 
-// Adds element after element, corner after corner: the order in which a batch does it.
+// Adds element after element, corner after corner: the order of a batch.
 template <class T, int W>
 PD_HD void scatter_corners(Quad<T>* g, const BlockPart<T>& part,
                            const Vec3<Pack<T, W>> (&force)[4]) {
@@ -136,7 +136,7 @@ PD_HD void scatter_corners(Quad<T>* g, const BlockPart<T>& part,
   }
 }
 
-// One sum a lane of the blocks, whichever way lanes run: the total has the same bits.
+// One sum for each lane of the blocks. Both layouts give the total the same bits.
 template <class Lanes>
 struct LaneSums;
 template <class T>
@@ -169,8 +169,7 @@ struct LaneSums<Batch<T, W>> {
   }
 };
 
-// What an element functor sees of the packs of elements that it works on at once, `s` counting them: elements of one
-// environment across lanes.
+// The packs of elements that a functor works on at once, counted by `s`: elements of one environment across lanes.
 template <int Fields, class T>
 struct ElementsAcross {
   static constexpr int W = native_width<T>, parts = block_lanes / W;
@@ -202,7 +201,7 @@ struct ElementsAcross {
   PD_HD void add(int s, const Vec3<R> (&g)[4]) const { scatter_corners<T, W>(forces, part(s), g); }
 };
 
-// The same for one element of W environments.
+// The same for one element of W environments across lanes.
 template <int Fields, class T, int W>
 struct EnvironmentsAcross {
   using R = Pack<T, W>;
@@ -250,7 +249,7 @@ struct ElementsOf<Fields, Batch<T, W>> {
   using type = EnvironmentsAcross<Fields, T, W>;
 };
 
-// element.run<N>(elements) on every pack of elements of a patch, Element::strip at a time.
+// Calls element.run<N>(elements) on every pack of elements of a patch, Element::strip at a time.
 template <class T, class Elements, class Element>
 PD_HD void each_element(const Plan<T>& plan, int patch, Elements elements, const Element& element) {
   const int end = Elements::packs(plan.patch_block[patch + 1]);
@@ -261,7 +260,7 @@ PD_HD void each_element(const Plan<T>& plan, int patch, Elements elements, const
   for (; elements.first < end; ++elements.first) element.template run<1>(elements);
 }
 
-// A functor of one pack of elements, element(elements, s).
+// Wraps a functor of one pack of elements, element(elements, s).
 template <class Function>
 struct OneByOne {
   static constexpr int strip = 1;

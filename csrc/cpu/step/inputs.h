@@ -1,4 +1,4 @@
-// What the user gave, lane by lane: environments past the batch repeat its last one.
+// The user's inputs, lane by lane: environments past the batch repeat its last one.
 #pragma once
 #include "cpu/step/lanes.h"
 
@@ -45,7 +45,7 @@ struct Inputs {
     return r;
   }
 
-  // visit(vertex, spring, target), an infinite spring meaning that the vertex stays on its target
+  // visit(vertex, spring, target); an infinite spring holds the vertex on its target
   template <class Visit>
   void each_pin(Visit visit) const {
     for (int p = 0; p < call.plan.pins; ++p) {

@@ -1,6 +1,6 @@
-// What runs across SIMD lanes: the elements of one environment (Single), or W environments (Batch).
+// The two layouts of SIMD lanes: the elements of one environment (Single), or W environments (Batch).
 //
-// Both give the same bits for an environment: the same operations in the same order, only grouped differently.
+// Both give an environment the same bits: the same operations in the same order, grouped differently.
 #pragma once
 #include "math/pack.h"
 #include "views/views.h"

@@ -7,7 +7,7 @@ namespace pd::inline PD_TARGET {
 template <class Lanes, class Visit>
 void each_in_a_piece(const Plan<typename Lanes::Scalar>& plan, const Visit& visit) {
   for (int i = 0; i < plan.vertices; ++i) {
-    if (plan.vertex_group[i] >= 0) visit(i, plan.vertex_group[i]);
+    if (plan.vertex_component[i] >= 0) visit(i, plan.vertex_component[i]);
   }
 }
 
@@ -25,19 +25,19 @@ void begin_still(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
   using T = typename Lanes::Scalar;
   using Real = typename Lanes::Real;
   using Wide = typename Lanes::Wide;
-  for (int g = 0; g < plan.groups; ++g) {
-    for (Wide& sum : w.group_sums[g].start) sum = Wide(0.0);
+  for (int g = 0; g < plan.components; ++g) {
+    for (Wide& sum : w.component_sums[g].start) sum = Wide(0.0);
   }
   const Real none(T(0));
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     const auto v = vertex(i);
     const auto vec3 = [](const auto& a) { return Lanes::vec3(a); };
-    add_start(w.group_sums[g].start, contacts, vec3(v.x), vec3(v.target), v.inertia, v.inverse,
-              vec3(w.u[i]), vec3(v.still(contacts)), vec3(w.u[i] - guess(i)));
+    add_start(w.component_sums[g].start, contacts, vec3(v.x), vec3(v.target), v.inertia, v.inverse,
+              vec3(w.u[i]), vec3(v.current_iterate(contacts)), vec3(w.u[i] - guess(i)));
   });
   bool some = false;
-  for (int g = 0; g < plan.groups; ++g) {
-    GroupSums<Wide>& sums = w.group_sums[g];
+  for (int g = 0; g < plan.components; ++g) {
+    ComponentSums<Wide>& sums = w.component_sums[g];
     sums.still = false;
     for (int lane = 0; lane < Lanes::environments; ++lane) {
       double sum[StartSums::count];
@@ -50,9 +50,10 @@ void begin_still(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
   }
   if (!some) return;
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
-    if (!w.group_sums[g].still) return;
+    if (!w.component_sums[g].still) return;
     const auto stays = w.still[g] > none;
-    const Vec3<Real> u = Lanes::vec3(w.u[i]), still = Lanes::vec3(vertex(i).still(contacts));
+    const Vec3<Real> u = Lanes::vec3(w.u[i]),
+                     still = Lanes::vec3(vertex(i).current_iterate(contacts));
     w.u[i] = Lanes::value(
         {select(stays, still.x, u.x), select(stays, still.y, u.y), select(stays, still.z, u.z)});
   });
@@ -66,23 +67,24 @@ void sum_pieces(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
     return Vec3<Wide>{Lanes::widen(a.x), Lanes::widen(a.y), Lanes::widen(a.z)};
   };
   const auto at = [&](int i) { return widen(Lanes::vec3(w.x[i])) + widen(Lanes::vec3(w.u[i])); };
-  for (int g = 0; g < plan.groups; ++g) w.group_sums[g] = {};
+  for (int g = 0; g < plan.components; ++g) w.component_sums[g] = {};
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
-    add_mean(w.group_sums[g].rigid + S::weight, Lanes::widen(w.inertia[i]), at(i));
+    add_mean(w.component_sums[g].rigid + S::weight, Lanes::widen(w.inertia[i]), at(i));
   });
-  for (int g = 0; g < plan.groups; ++g) {
-    GroupSums<Wide>& sums = w.group_sums[g];
+  for (int g = 0; g < plan.components; ++g) {
+    ComponentSums<Wide>& sums = w.component_sums[g];
     const Wide weight = sums.rigid[S::weight], none(0.0), one(1.0);
     const Wide share = one / select(weight > none, weight, one);
     const Wide* sum = sums.rigid + S::position;
     sums.center = {share * sum[0], share * sum[1], share * sum[2]};
   }
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
-    GroupSums<Wide>& sums = w.group_sums[g];
+    ComponentSums<Wide>& sums = w.component_sums[g];
     const Wide a = Lanes::widen(w.inertia[i]);
-    const Vec3<Wide> arm = at(i) - sums.center;
-    add_moments(sums.rigid + S::lag, a, arm, widen(Lanes::vec3(w.target[i] - w.u[i])));
-    if (plan.pins > 0) add_pin(sums.rigid + S::pins, a, arm);
+    const Vec3<Wide> lever_arm = at(i) - sums.center;
+    add_moments(sums.rigid + S::target_offset, a, lever_arm,
+                widen(Lanes::vec3(w.target[i] - w.u[i])));
+    if (plan.pins > 0) add_pin(sums.rigid + S::pins, a, lever_arm);
   });
 }
 
@@ -103,14 +105,14 @@ void set_motion(Workspace<Lanes>& w, int g, int lane, const RigidMotion<double>&
 template <class Lanes>
 RigidFit fit_of(const Workspace<Lanes>& w, int g, int lane) {
   double sum[RigidSums::count];
-  read_lane<RigidSums::count, Lanes>(w.group_sums[g].rigid, lane, sum);
+  read_lane<RigidSums::count, Lanes>(w.component_sums[g].rigid, lane, sum);
   return RigidFit(sum);
 }
 
 // Of pieces that go on, or in the first leg all.
 template <class Lanes>
 void free_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w, int leg) {
-  for (int g = 0; g < plan.groups; ++g) {
+  for (int g = 0; g < plan.components; ++g) {
     for (int lane = 0; lane < Lanes::environments; ++lane) {
       bool& goes_on = w.goes_on[g * Lanes::environments + lane];
       goes_on = goes_on || leg == 0;
@@ -135,14 +137,14 @@ void find_touched(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
                   const Contacts<typename Lanes::Real>& contacts, bool first) {
   using Real = typename Lanes::Real;
   using Wide = typename Lanes::Wide;
-  for (int g = 0; g < plan.groups; ++g) {
-    GroupSums<Wide>& sums = w.group_sums[g];
+  for (int g = 0; g < plan.components; ++g) {
+    ComponentSums<Wide>& sums = w.component_sums[g];
     for (Wide& least : sums.gaps) least = Wide(HUGE_VAL);
     for (Wide& sum : sums.touch) sum = Wide(0.0);
     for (Wide& least : sums.bounds) least = Wide(HUGE_VAL);
   }
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
-    GroupSums<Wide>& sums = w.group_sums[g];
+    ComponentSums<Wide>& sums = w.component_sums[g];
     const auto near = [&](int k, const Real& gap) {
       sums.gaps[k] = lesser(sums.gaps[k], Lanes::widen(gap));
     };
@@ -157,7 +159,7 @@ template <class Lanes>
 unsigned touched_by(const Workspace<Lanes>& w, int g, int lane) {
   unsigned touched = 0;
   for (int k = 0; k <= Touch::planes; ++k) {
-    if (!(Lanes::lane(w.group_sums[g].gaps[k], lane) > 0)) touched |= 1u << k;
+    if (!(Lanes::lane(w.component_sums[g].gaps[k], lane) > 0)) touched |= 1u << k;
   }
   return touched;
 }
@@ -166,7 +168,7 @@ unsigned touched_by(const Workspace<Lanes>& w, int g, int lane) {
 template <class Lanes>
 void set_motion_on_contacts(Workspace<Lanes>& w, const Contacts<typename Lanes::Real>& contacts,
                             int g, int lane) {
-  const auto& sums = w.group_sums[g];
+  const auto& sums = w.component_sums[g];
   double touch[Touch::sums], bounds[Touch::bounds];
   read_lane<Touch::sums, Lanes>(sums.touch, lane, touch);
   read_lane<Touch::bounds, Lanes>(sums.bounds, lane, bounds);
@@ -205,8 +207,8 @@ bool tip_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
   using Wide = typename Lanes::Wide;
   constexpr int lanes = Lanes::environments;
   bool some = false;
-  for (int g = 0; g < plan.groups; ++g) {
-    bool& tips = w.group_sums[g].tips;
+  for (int g = 0; g < plan.components; ++g) {
+    bool& tips = w.component_sums[g].tips;
     tips = false;
     for (int lane = 0; lane < lanes; ++lane) tips = tips || w.tipping[g * lanes + lane].goes_on();
     some = some || tips;
@@ -215,23 +217,23 @@ bool tip_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
   const auto widen = [](const Vec3<Real>& a) {
     return Vec3<Wide>{Lanes::widen(a.x), Lanes::widen(a.y), Lanes::widen(a.z)};
   };
-  for (int g = 0; g < plan.groups; ++g) {
-    for (Wide& number : w.group_sums[g].found) number = Wide(HUGE_VAL);
+  for (int g = 0; g < plan.components; ++g) {
+    for (Wide& number : w.component_sums[g].found) number = Wide(HUGE_VAL);
   }
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
-    if (!w.group_sums[g].tips) return;
+    if (!w.component_sums[g].tips) return;
     const Vec3<Real> u = Lanes::vec3(w.u[i]), y = Lanes::vec3(w.x[i] + w.u[i]);
     Real order, depth, left;
     w.search[g].look(contacts, w.motion[g], y, order, depth, left);
-    keep_found(w.group_sums[g].found, Lanes::widen(order), Lanes::widen(depth), Lanes::widen(left),
-               widen(y), widen(u));
+    keep_found(w.component_sums[g].found, Lanes::widen(order), Lanes::widen(depth),
+               Lanes::widen(left), widen(y), widen(u));
   });
-  for (int g = 0; g < plan.groups; ++g) {
+  for (int g = 0; g < plan.components; ++g) {
     for (int lane = 0; lane < lanes; ++lane) {
       Tipping& tipping = w.tipping[g * lanes + lane];
       if (!tipping.goes_on()) continue;
       double found[Found::count];
-      read_lane<Found::count, Lanes>(w.group_sums[g].found, lane, found);
+      read_lane<Found::count, Lanes>(w.component_sums[g].found, lane, found);
       RigidMotion<double> motion;
       if (tipping.next(fit_of(w, g, lane), plane_of<Lanes>(contacts, tipping.number, lane), found,
                        motion)) {
@@ -254,7 +256,7 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
   using Wide = typename Lanes::Wide;
   constexpr int lanes = Lanes::environments;
   find_touched(plan, w, contacts, first);
-  for (int g = 0; g < plan.groups; ++g) {
+  for (int g = 0; g < plan.components; ++g) {
     for (int lane = 0; lane < lanes; ++lane) {
       const bool goes_on = w.goes_on[g * lanes + lane];
       const unsigned touched = goes_on ? touched_by(w, g, lane) : 0;
@@ -263,7 +265,7 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
       bool tips = false;
       if (contacts.plane_count > 0) {
         double touch[Touch::sums];
-        read_lane<Touch::sums, Lanes>(w.group_sums[g].touch, lane, touch);
+        read_lane<Touch::sums, Lanes>(w.component_sums[g].touch, lane, touch);
         Tipping& tipping = w.tipping[g * lanes + lane];
         begin_tipping(tipping, first, fit_of(w, g, lane), touched, touch,
                       [&](int k) { return plane_of<Lanes>(contacts, k, lane); });
@@ -275,19 +277,19 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
   }
   while (contacts.plane_count > 0 && tip_motions(plan, w, contacts)) {
   }
-  if (!contacts.has_several()) return;
+  if (!contacts.has_multiple()) return;
   // what is left must not lead into other contacts
-  for (int g = 0; g < plan.groups; ++g) w.group_sums[g].gaps[0] = Wide(HUGE_VAL);
+  for (int g = 0; g < plan.components; ++g) w.component_sums[g].gaps[0] = Wide(HUGE_VAL);
   each_in_a_piece<Lanes>(plan, [&](int i, int g) {
     const auto touches = [&](int k) { return w.touched[g][k] > Real(T(0)); };
     const Vec3<Real> y = Lanes::vec3(w.x[i] + w.u[i]);
     const Real least = least_gap_beside(contacts, y, w.motion[g].of(y), !first, touches);
-    w.group_sums[g].gaps[0] = lesser(w.group_sums[g].gaps[0], Lanes::widen(least));
+    w.component_sums[g].gaps[0] = lesser(w.component_sums[g].gaps[0], Lanes::widen(least));
   });
-  for (int g = 0; g < plan.groups; ++g) {
+  for (int g = 0; g < plan.components; ++g) {
     for (int lane = 0; lane < lanes; ++lane) {
       const bool tips = contacts.plane_count > 0 && w.tipping[g * lanes + lane].tips;
-      if (tips || Lanes::lane(w.group_sums[g].gaps[0], lane) > 0) continue;
+      if (tips || Lanes::lane(w.component_sums[g].gaps[0], lane) > 0) continue;
       set_motion(w, g, lane, fit_of(w, g, lane).still());
       w.goes_on[g * lanes + lane] = false;
     }
@@ -295,15 +297,15 @@ void limit_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w
 }
 
 // Motions of all pieces, in one leg; whether some go on in another.
-template <bool Touching, class Lanes>
+template <bool HasContacts, class Lanes>
 bool find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
                   const Contacts<typename Lanes::Real>& contacts, bool first, int leg) {
   sum_pieces(plan, w);
   free_motions(plan, w, leg);
   bool some = false;
-  if constexpr (Touching) {
+  if constexpr (HasContacts) {
     limit_motions(plan, w, contacts, first);
-    for (int n = 0; n < plan.groups * Lanes::environments; ++n) some = some || w.goes_on[n];
+    for (int n = 0; n < plan.components * Lanes::environments; ++n) some = some || w.goes_on[n];
   }
   return some && leg + 1 < motion_legs;
 }

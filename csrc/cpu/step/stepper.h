@@ -9,8 +9,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// `Touching`: see solver/vertex.h.
-template <class Lanes, bool Touching>
+// `HasContacts`: see solver/vertex.h.
+template <class Lanes, bool HasContacts>
 class Stepper {
  protected:
   using T = typename Lanes::Scalar;
@@ -35,14 +35,14 @@ class Stepper {
         theta_(T(set_.relaxation)) {}
 
   // All steps of the call, with a record every `set_.every`.
-  void roll() {
+  void rollout() {
     load();
-    weigh();
+    assemble_diagonal();
     for (int t = 0; t < set_.steps; ++t) {
       step(*this, set_);
       if (is_ended()) return;
       if ((t + 1) % set_.every == 0) store((t + 1) / set_.every - 1);
-      move_balls();
+      move_spheres();
     }
   }
 
@@ -65,12 +65,12 @@ class Stepper {
 
   void start() {
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      w_.u[i] = w_.before[i] = vertex(i).first(contacts_, guess(i));
+      w_.u[i] = w_.before[i] = vertex(i).first_iterate(contacts_, guess(i));
     }
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       schedule_[lane] = Schedule(set_, least_[lane], Lanes::lane(friction, lane) > 0);
-      coming_[lane] = schedule_[lane].next(0);
+      next_omega_[lane] = schedule_[lane].next(0);
       used_[lane] = 0;
       done_[lane] = false;
     }
@@ -78,12 +78,12 @@ class Stepper {
     team_.barrier();
   }
 
-  // Exact minimum of E along the rigid motions of every piece, as far as pins and contacts leave them to it.
+  // Exact minimum of E along the rigid motions of every component that pins and contacts leave free.
   void align() {
     const bool first = !started_;
     started_ = true;
-    if (plan_.groups == 0 || (first && set_.start() == StartKind::given)) return;
-    if constexpr (Touching) {
+    if (plan_.components == 0 || (first && set_.start() == StartKind::given)) return;
+    if constexpr (HasContacts) {
       if (first && team_.rank == 0)
         begin_still(
             plan_, w_, contacts_, [&](int i) { return vertex(i); },
@@ -91,21 +91,22 @@ class Stepper {
     }
     bool goes_on = true;
     for (int leg = 0; goes_on; ++leg) {
-      if (team_.rank == 0) w_.some_go_on = find_motions<Touching>(plan_, w_, contacts_, first, leg);
+      if (team_.rank == 0)
+        w_.some_go_on = find_motions<HasContacts>(plan_, w_, contacts_, first, leg);
       team_.barrier();
       goes_on = w_.some_go_on;
       for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-        if (plan_.vertex_group[i] < 0) continue;
+        if (plan_.vertex_component[i] < 0) continue;
         const Vec3<Real> y = Lanes::vec3(w_.x[i] + w_.u[i]);
-        const Vec3<Real> way = w_.motion[plan_.vertex_group[i]].of(y);
-        w_.u[i] = vertex(i).moved(w_.u[i], way);
+        const Vec3<Real> displacement = w_.motion[plan_.vertex_component[i]].of(y);
+        w_.u[i] = vertex(i).displaced(w_.u[i], displacement);
         if (first) w_.before[i] = w_.u[i];
       }
       team_.barrier();
     }
   }
 
-  // What the first iterate is made of.
+  // The guess that the first iterate is made from.
   Value guess(std::int64_t i) const {
     if (set_.start() == StartKind::given) return in_.at_vertex(call_.start, i) - w_.x[i];
     return set_.start() == StartKind::inertial ? w_.target[i] : Real(h_) * w_.velocity[i];
@@ -113,10 +114,10 @@ class Stepper {
 
   void iterate(int k) {
     for (int lane = 0; lane < width; ++lane) {
-      Lanes::set_lane(omega_, lane, T(coming_[lane]));
+      Lanes::set_lane(omega_, lane, T(next_omega_[lane]));
       Lanes::set_lane(active_, lane, T(done_[lane] ? 0 : 1));
     }
-    const bool guard = schedule_[0].wants_energy(k);
+    const bool guard = schedule_[0].checks_energy(k);
     if (guard) {
       sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
         sums.energy = vertex(i).add_energy(w_.u[i], sums.energy);
@@ -137,7 +138,7 @@ class Stepper {
     return true;
   }
 
-  // Whether the call is to end now; then nothing of this step counts.
+  // Whether the call was interrupted; then nothing of this step counts.
   bool is_ended() const { return team_.ended(std::int64_t(plan_.vertices) * width); }
 
   void finish() {
@@ -157,7 +158,7 @@ class Stepper {
     return inertia_target(weight, mass, w_.velocity[i], gravity_, force, spring, pin, h);
   }
 
-  PD_HD Vertex<Lanes, Touching> vertex(std::int64_t i) const {
+  PD_HD Vertex<Lanes, HasContacts> vertex(std::int64_t i) const {
     return {w_.x[i], w_.target[i], w_.inertia[i], w_.inverse[i]};
   }
 
@@ -170,11 +171,11 @@ class Stepper {
     gravity_ = in_.vector(call_.material.gravity, 0);
     for (int lane = 0; lane < width; ++lane) {
       stop_[lane] = {
-          square_of_fall(plan_.vertices, set_.time_step, Lanes::get_lane(gravity_, lane))};
+          squared_free_fall(plan_.vertices, set_.time_step, Lanes::get_lane(gravity_, lane))};
     }
     damping_ = in_.number(call_.material.damping, 0);
     const Material<T>& material = call_.material;
-    contacts_ = {w_.planes, w_.balls, material.planes_count, material.spheres_count};
+    contacts_ = {w_.planes, w_.spheres, material.planes_count, material.spheres_count};
     if (team_.rank == 0) {
       for (int c = 0; c < material.planes_count; ++c) {
         w_.planes[c] = {Lanes::vec3(in_.vector(material.planes, planes_numbers * c)),
@@ -182,7 +183,7 @@ class Stepper {
                         in_.number(material.planes, planes_numbers * c + planes_friction)};
       }
       for (int c = 0; c < material.spheres_count; ++c) {
-        w_.balls[c] = {
+        w_.spheres[c] = {
             Lanes::vec3(in_.vector(material.spheres, spheres_numbers * c)),
             Lanes::vec3(in_.vector(material.spheres, spheres_numbers * c + spheres_motion)),
             in_.number(material.spheres, spheres_numbers * c + spheres_radius),
@@ -192,16 +193,16 @@ class Stepper {
     team_.barrier();
   }
 
-  void move_balls() {
+  void move_spheres() {
     if (team_.rank == 0) {
-      for (int c = 0; c < contacts_.ball_count; ++c)
-        w_.balls[c].center = w_.balls[c].center + w_.balls[c].motion;
+      for (int c = 0; c < contacts_.sphere_count; ++c)
+        w_.spheres[c].center = w_.spheres[c].center + w_.spheres[c].motion;
     }
-    if (contacts_.ball_count) team_.barrier();
+    if (contacts_.sphere_count) team_.barrier();
   }
 
   // a and 1 / D of every vertex, w V of every element, and the smallest a / D
-  void weigh() {
+  void assemble_diagonal() {
     const Real none(T(0));
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
       w_.inertia[i] = inertia_weight(in_.number(call_.material.masses, plan_.vertex_order[i]),
@@ -218,7 +219,7 @@ class Stepper {
       const Real a = w_.inertia[i];
       const Real elastic = Lanes::vec3(force).x;
       w_.inverse[i] = inverse_diagonal(a, elastic);
-      sums.least = lesser(sums.least, share_of_inertia(a, elastic, w_.inverse[i]));
+      sums.least = lesser(sums.least, inertia_ratio(a, elastic, w_.inverse[i]));
     });
     Real least = Real(T(HUGE_VAL));
     for (int part = 0; part < w_.part_count; ++part) least = lesser(least, w_.parts[0][part].least);
@@ -247,10 +248,10 @@ class Stepper {
     if (set_.tolerance > 0) {
       // environments that are done keep their iterate
       next = select(active_ > Real(T(0)), next, u);
-      // nothing of both where a pin holds the vertex on its target
-      const Value change = next - u, way = u - w_.target[i];
+      // both are zero where a pin holds the vertex on its target
+      const Value change = next - u, displacement = u - w_.target[i];
       sums.first = multiply_add(change, change, sums.first);
-      sums.second = multiply_add(way, way, sums.second);
+      sums.second = multiply_add(displacement, displacement, sums.second);
     }
     w_.before[i] = u;
     w_.u[i] = next;
@@ -266,14 +267,14 @@ class Stepper {
     return sum;
   }
 
-  // every thread adds up the same parts in the same order, so all come to the same decisions
+  // every thread adds up the same parts in the same order, so all make the same decisions
   void conclude(int k, bool guard) {
     const bool soft = set_.tolerance > 0;
     double omega[width];  // of this iteration
     for (int lane = 0; lane < width; ++lane) {
       used_[lane] += done_[lane] ? 0 : 1;
-      omega[lane] = coming_[lane];
-      coming_[lane] = schedule_[lane].next(k + 1);
+      omega[lane] = next_omega_[lane];
+      next_omega_[lane] = schedule_[lane].next(k + 1);
     }
     if (!guard && !soft) return;
     const auto sum = total(k & 1);
@@ -281,9 +282,10 @@ class Stepper {
       if (done_[lane]) continue;
       if (guard) schedule_[lane].check(Lanes::lane(sum.energy, lane));
       if (!soft) continue;
-      const double change = Lanes::lane(sum.first, lane), way = Lanes::lane(sum.second, lane);
-      const Share share = schedule_[lane].share_of(omega[lane]);
-      done_[lane] = stop_[lane].ends(set_.tolerance, share, change, way);
+      const double change = Lanes::lane(sum.first, lane),
+                   displacement = Lanes::lane(sum.second, lane);
+      const ErrorShare share = schedule_[lane].error_share(omega[lane]);
+      done_[lane] = stop_[lane].is_met(set_.tolerance, share, change, displacement);
     }
   }
 
@@ -328,8 +330,8 @@ class Stepper {
   Real damping_{T(0)}, omega_{T(1)}, active_{T(1)};
   double least_[width] = {};
   Schedule schedule_[width];
-  double coming_[width] = {};  // the next omega
-  SoftStop stop_[width];
+  double next_omega_[width] = {};  // the next omega
+  StoppingTest stop_[width];
   int used_[width] = {};
   bool done_[width] = {};
   bool started_ = false;  // has a first iterate

@@ -1,7 +1,8 @@
-// One pass over the mesh: element forces patch by patch, then every vertex once with the force on it.
+// One pass over the mesh: element forces patch by patch, then one visit of every vertex with its force.
 //
-// Interior vertices are visited as soon as their patch is done, while it is in the cache; shared ones in a second pass that
-// adds what the patches left, in patch order. The partition is fixed by the plan, so the bits do not depend on threads.
+// Interior vertices are visited right after their patch, while it is in the cache. Shared ones follow in a second
+// pass that adds the patches' forces in patch order. The plan fixes the partition, so the bits do not depend on
+// threads.
 #pragma once
 #include "cpu/step/element_blocks.h"
 #include "cpu/step/workspace.h"
@@ -26,7 +27,7 @@ struct Scratch {
   Storage storage_;
 };
 
-// Sums that the visits of one part make; components are added up at its end.
+// Sums over the visits of one part; components are added up at its end.
 template <class Lanes>
 struct Sums {
   typename Lanes::Value energy, first, second;
@@ -84,7 +85,7 @@ struct Sweep {
     team.barrier();
   }
 
-  // Positions relative to the first vertex of each patch, which keep their last bits however far from the origin.
+  // Positions relative to the first vertex of each patch keep their last bits however far from the origin.
   void set_origins() {
     for (int patch = team.begin(plan.patches); patch < team.end(plan.patches); ++patch) {
       const int first = plan.patch_slot[patch], end = plan.patch_slot[patch + 1];
@@ -95,7 +96,7 @@ struct Sweep {
     }
   }
 
-  // Copies what the slots of a patch refer to, for elements to read.
+  // Copies the vertices of a patch's slots, for elements to read.
   template <int Fields>
   void gather_slots(int patch) {
     const int first = plan.patch_slot[patch], count = plan.patch_slot[patch + 1] - first;

@@ -15,14 +15,14 @@ struct FreeAligned {
 };
 using Storage = std::unique_ptr<std::byte[], FreeAligned>;
 
-// Zeroed, because the unused fourth component of a quad is read along.
+// Zeroed, because vector loads read the unused fourth component of a quad.
 inline Storage allocate_zeroed(std::size_t bytes) {
   return Storage(new (std::align_val_t{64}) std::byte[bytes]());
 }
 
-// of a loose piece, see solver/rigid/free_motion.h
+// sums of a component with free rigid motions, see solver/rigid/free_motion.h
 template <class Wide>
-struct GroupSums {
+struct ComponentSums {
   Wide start[StartSums::count];
   Wide rigid[RigidSums::count];
   Vec3<Wide> center;
@@ -49,20 +49,20 @@ struct Workspace {
   Value *x, *velocity, *force, *target, *u, *before;  // [vertices]
   Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
   Value *origin, *shared_force;                       // [slots]
-  Part* parts[2];               // iterations alternate, so that nobody overwrites what others read
-  GroupSums<Wide>* group_sums;  // [groups]
-  RigidMotion<Real>* motion;    // [groups]
-  Real (*touched)[Touch::planes];  // [groups] 1 for each of the first planes that it touches
-  Real* still;                     // [groups] 1 if it starts from where it is
-  Tipping* tipping;                // [groups, environments]
-  bool* goes_on;                   // [groups, environments] moves in this leg, then: in the next
-  TippingSearch<Real>* search;     // [groups]
+  Part* parts[2];  // iterations alternate, so that no thread overwrites sums that others read
+  ComponentSums<Wide>* component_sums;  // [components]
+  RigidMotion<Real>* motion;            // [components]
+  Real (*touched)[Touch::planes];  // [components] 1 for each of the first planes that it touches
+  Real* still;                     // [components] 1 if it starts from its current position
+  Tipping* tipping;                // [components, environments]
+  bool* goes_on;                // [components, environments] moves in this leg, then: in the next
+  TippingSearch<Real>* search;  // [components]
   Plane<Real>* planes;
-  Ball<Real>* balls;
+  Sphere<Real>* spheres;
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
   int part_count;
   bool shared_weight;
-  bool some_go_on = false;  // in the next leg, of any environment
+  bool some_go_on = false;  // some environment moves in the next leg
 
   explicit Workspace(const StepCall<T>& call)
       : Workspace(call.plan, call.material, call.material.stiffness.stride == 0,
@@ -97,16 +97,16 @@ struct Workspace {
     place(origin, plan.slots, base);
     place(shared_force, plan.shared ? plan.slots : 0, base);
     for (Part*& array : parts) place(array, part_count, base);
-    place(group_sums, plan.groups, base);
-    place(motion, plan.groups, base);
-    place(touched, plan.groups, base);
-    place(still, plan.groups, base);
-    const int tipping_groups = material.planes_count > 0 ? plan.groups : 0;
-    place(tipping, tipping_groups * Lanes::environments, base);
-    place(search, tipping_groups, base);
-    place(goes_on, plan.groups * Lanes::environments, base);
+    place(component_sums, plan.components, base);
+    place(motion, plan.components, base);
+    place(touched, plan.components, base);
+    place(still, plan.components, base);
+    const int tipping_components = material.planes_count > 0 ? plan.components : 0;
+    place(tipping, tipping_components * Lanes::environments, base);
+    place(search, tipping_components, base);
+    place(goes_on, plan.components * Lanes::environments, base);
     place(planes, material.planes_count, base);
-    place(balls, material.spheres_count, base);
+    place(spheres, material.spheres_count, base);
     place(weight,
           std::int64_t(plan.blocks) * block_lanes * (shared_weight ? 1 : Lanes::environments),
           base);

@@ -186,10 +186,10 @@ class ConjugateTeam {
         });
     team_.barrier();
     squares_.reduce(sum, warp_sums_);
-    numbers.judge(sum[0], call_.tolerance);
+    numbers.check_residual(sum[0], call_.tolerance);
     if (!numbers.active) return;
     if constexpr (WithLevels) sum[1] = apply_levels();
-    keep_ = T(numbers.keep(sum[1]));
+    keep_ = T(numbers.direction_ratio(sum[1]));
     direction_pending_ = true;
   }
 

@@ -45,11 +45,11 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     if (numbers.active) {
       k = Base::iterate_all(numbers);
       friction.scale = numbers.scale;
-      friction.left += k;
-      if (slides && adds_friction(numbers, call_.tolerance)) begin(friction);
+      friction.products_left += k;
+      if (slides && continues_with_friction(numbers, call_.tolerance)) begin(friction);
     }
     if (friction.active()) {
-      for (; friction.active() && (k < call_.iterations || !friction.pauses()); ++k)
+      for (; friction.active() && (k < call_.iterations || !friction.may_pause()); ++k)
         advance(friction);
       friction.active() ? scale_cycle(unit_) : press_solution();
     }
@@ -94,12 +94,14 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
 
   // Replaces the solution y by the multiplier G^T y.
   __device__ void press_solution() {
-    each_vertex([&](int i) { m_.solution[i] = quad(press(vec3(m_.solution[i]), sliding(i))); });
+    each_vertex([&](int i) {
+      m_.solution[i] = quad(transposed_friction(vec3(m_.solution[i]), sliding(i)));
+    });
   }
 
   // Called after the solve of the symmetric part.
   __device__ void begin(FrictionSolve& friction) {
-    friction.begin(friction.left, adjoint_iterations);
+    friction.begin(friction.products_left, adjoint_iterations);
     direction_pending_ = false;
     each_part(
         0, plan_.vertices, [&](int i) { m_.correction[i] = quad(Vec3<T>{T(0), T(0), T(0)}); },
@@ -118,7 +120,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
   __device__ void multiply(FrictionStage stage) {
     const T per_unit = T(1) / unit_;
     double sum[2] = {0, 0};
-    const auto pressed = [&](int i) { return press(z(stage, i), sliding(i)); };
+    const auto pressed = [&](int i) { return transposed_friction(z(stage, i), sliding(i)); };
     const auto visit = [&](int i, const Vec3<T>& elastic, const Vec3<T>&) {
       const Quad<T> residual = m_.residual[i];
       const Vec3<T> image = friction_image(elastic, z(stage, i), last_[i].w, residual.w != T(0),
@@ -152,7 +154,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     double sum[2];
     products_.reduce(sum, warp_sums_);
     if (stage == FrictionStage::residual) return correct(friction, sum[0]);
-    const T step = T(first ? friction.go(sum[0]) : friction.smooth(sum[0], sum[1]));
+    const T step = T(first ? friction.search_step(sum[0]) : friction.residual_step(sum[0], sum[1]));
     // before the next product overwrites the partial sums
     if (first && friction.stage == FrictionStage::residual) return team_.barrier();
     const Quad<T>* const product = first ? m_.image : m_.smoothed;
@@ -174,7 +176,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
     team_.barrier();
     if (first) return;
     squares_.reduce(left, warp_sums_);
-    const T keep = T(friction.judge(left[0], left[1], call_.tolerance));
+    const T keep = T(friction.finish_iteration(left[0], left[1], call_.tolerance));
     each_part(
         0, plan_.vertices,
         [&](int i) {

@@ -35,7 +35,7 @@ class FrictionBlock {
     while (friction.active()) advance(friction);
     each_slot([&](int, int, std::int64_t at) {
       write3(call_.solution + at,
-             press(read3(call_.solution + at), call_.sliding + slide_count * at));
+             transposed_friction(read3(call_.solution + at), call_.sliding + slide_count * at));
     });
   }
 
@@ -59,7 +59,8 @@ class FrictionBlock {
 
   __device__ void multiply(FrictionStage stage) const {
     each_slot([&](int s, int i, std::int64_t at) {
-      fields_.both.set_second(s, press(z(stage, i, at), call_.sliding + slide_count * at));
+      fields_.both.set_second(
+          s, transposed_friction(z(stage, i, at), call_.sliding + slide_count * at));
     });
     __syncthreads();
     each_pair<2>(fields_.patch, fields_, rest_of<false>(fields_.patch),
@@ -92,7 +93,8 @@ class FrictionBlock {
     block_reduce<Add>(sums, warp_sums_);
     if (stage == FrictionStage::residual) return correct(friction, sums[0]);
     const bool first = stage == FrictionStage::first;
-    const T step = T(first ? friction.go(sums[0]) : friction.smooth(sums[0], sums[1]));
+    const T step =
+        T(first ? friction.search_step(sums[0]) : friction.residual_step(sums[0], sums[1]));
     if (first && friction.stage == FrictionStage::residual) return;
     const T* const product = first ? image_ : v_.smoothed;
     double left[2] = {0, 0};
@@ -105,7 +107,7 @@ class FrictionBlock {
     });
     if (first) return;
     block_reduce<Add>(left, warp_sums_);
-    const T keep = T(friction.judge(left[0], left[1], call_.tolerance));
+    const T keep = T(friction.finish_iteration(left[0], left[1], call_.tolerance));
     each_slot([&](int, int, std::int64_t at) {
       const Vec3<T> last = subtract_product(read3(call_.direction + at), step, read3(image_ + at));
       write3(call_.direction + at, multiply_add(keep, last, read3(call_.residual + at)));

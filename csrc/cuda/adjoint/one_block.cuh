@@ -107,9 +107,9 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
       sums[1] += double(inverse[i]) * square;
     });
     block_reduce<Add>(sums, warp_sums);
-    numbers.judge(sums[0], call.tolerance);
+    numbers.check_residual(sums[0], call.tolerance);
     if (!numbers.active) break;
-    const T keep = T(numbers.keep(sums[1]));
+    const T keep = T(numbers.direction_ratio(sums[1]));
     each_slot([&](int s, int i, std::int64_t at) {
       fields.both.set_second(
           s, multiply_add(keep, direction_of(s), inverse[i] * read3(call.residual + at)));
@@ -117,7 +117,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     __syncthreads();
   }
   if constexpr (WithFriction) {
-    if (largest[1] > 0 && adds_friction(numbers, call.tolerance)) {
+    if (largest[1] > 0 && continues_with_friction(numbers, call.tolerance)) {
       FrictionSolve friction(nullptr, numbers.scale);
       friction.begin(products, adjoint_iterations);
       FrictionBlock<T>(work.product, call, work.friction, work.image, fields, unit, warp_sums)

@@ -21,14 +21,14 @@ PD_DEVICE void visit_adjoint_vertex(const DeviceAdjointSystem<T>& call, const Vi
 template <class T>
 __global__ void __launch_bounds__(field_threads)
     adjoint_system(const __grid_constant__ DeviceAdjointSystem<T> call) {
-  visit_adjoint_vertex(call, [](const auto& vertex) { vertex.solve_for(); });
+  visit_adjoint_vertex(call, [](const auto& vertex) { vertex.write_system(); });
 }
 
 template <class T>
 __global__ void __launch_bounds__(field_threads)
     contact_gradients(const __grid_constant__ DeviceContactGradients<T> call) {
   visit_adjoint_vertex(call.step,
-                       [&](const auto& vertex) { ContactGradients(call, vertex).give(); });
+                       [&](const auto& vertex) { ContactGradients(call, vertex).differentiate(); });
 }
 
 template <class T>
@@ -36,7 +36,7 @@ __global__ void __launch_bounds__(field_threads)
     adjoint_result(const __grid_constant__ AdjointResultCall<T> call) {
   const std::int64_t number = std::int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
   if (number >= call.batch * call.vertices) return;
-  AdjointAnswer<T>{call, number / call.vertices, number % call.vertices}.give();
+  AdjointResult<T>{call, number / call.vertices, number % call.vertices}.write();
 }
 
 // One block per component and environment.

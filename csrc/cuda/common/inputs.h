@@ -13,13 +13,13 @@ namespace pd::inline PD_TARGET {
 struct Progress {
   Schedule schedule;
   double min_share;  // smallest a / D
-  SoftStop stop;
+  StoppingTest stop;
   int used;  // iterations
   bool done;
 
   // Whether the tolerance is met, from the sums of an iteration with weight omega.
   PD_HD bool ends(double tolerance, double omega, double change, double displacement) {
-    return stop.ends(tolerance, schedule.share_of(omega), change, displacement);
+    return stop.is_met(tolerance, schedule.error_share(omega), change, displacement);
   }
 };
 
@@ -73,10 +73,10 @@ struct Inputs {
 
   PD_DEVICE double free_fall_squared() const {
     const Vec3<T> gravity = read3(call->material.gravity.of(environment));
-    return square_of_fall(call->plan.vertices, call->settings.time_step, gravity);
+    return squared_free_fall(call->plan.vertices, call->settings.time_step, gravity);
   }
 
-  PD_DEVICE void read_contacts(Plane<T>* planes, Ball<T>* spheres) const {
+  PD_DEVICE void read_contacts(Plane<T>* planes, Sphere<T>* spheres) const {
     const Material<T>& material = call->material;
     for (int c = 0; c < material.planes_count; ++c) {
       const T* p = material.planes.of(environment) + planes_numbers * c;

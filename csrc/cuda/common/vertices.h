@@ -47,11 +47,11 @@ struct Vertices {
     u[i] = before[i] = {T(0), T(0), T(0), T(0)};
   }
 
-  // Stores 1 / D and returns share_of_inertia.
+  // Stores 1 / D and returns inertia_ratio.
   PD_DEVICE double set_diagonal(int i, T elastic) const {
     const T a = inertia(i), inverse = inverse_diagonal(a, elastic);
     u[i].w = before[i].w = inverse;
-    return double(share_of_inertia(a, elastic, inverse));
+    return double(inertia_ratio(a, elastic, inverse));
   }
 
   PD_DEVICE void predict(int i, const Inputs<T>& in, int vertex, T h) const {
@@ -70,12 +70,12 @@ struct Vertices {
                           const Contacts<T>& contacts) const {
     const Settings& settings = in.call->settings;
     const bool given = settings.start() == StartKind::given;
-    return at(i).first(contacts,
-                       given ? in.first_iterate(vertex) - vec3(x[i]) : predicted(i, settings));
+    return at(i).first_iterate(
+        contacts, given ? in.first_iterate(vertex) - vec3(x[i]) : predicted(i, settings));
   }
 
   PD_DEVICE Vec3<T> moved(int i, const RigidMotion<T>& motion) const {
-    return at(i).moved(vec3(u[i]), motion.of(vec3(x[i]) + vec3(u[i])));
+    return at(i).displaced(vec3(u[i]), motion.of(vec3(x[i]) + vec3(u[i])));
   }
 
   PD_DEVICE void set(unsigned i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }

@@ -15,7 +15,7 @@ namespace pd {
 
 static_assert(sizeof(Control<double>) <= fused_control_bytes);
 static_assert(sizeof(Plane<float>) == planes_numbers * sizeof(float) &&
-              sizeof(Ball<float>) == spheres_numbers * sizeof(float));
+              sizeof(Sphere<float>) == spheres_numbers * sizeof(float));
 
 // Shared memory that the device reserves per block.
 constexpr std::size_t reserved_shared_bytes = 1024;

@@ -37,7 +37,7 @@ struct MotionFinder {
   PD_DEVICE void begin_still() {
     for (int s = threadIdx.x; s < slots; s += blockDim.x) {
       const int number = plan.slot_piece[first_slot + s];
-      if (number >= 0 && pieces[number].still) v.set(s, v.at(s).still(contacts));
+      if (number >= 0 && pieces[number].still) v.set(s, v.at(s).current_iterate(contacts));
     }
     __syncthreads();
   }
@@ -52,7 +52,7 @@ struct MotionFinder {
 template <class T, bool HasContacts, Blocks Kind>
 PD_DEVICE_COLD TeamSums<Kind> find_motions(MotionFinder<T, HasContacts, Kind> finder,
                                            Aligning how) {
-  find_in_rounds<HasContacts>(finder, how, finder.contacts.has_several());
+  find_in_rounds<HasContacts>(finder, how, finder.contacts.has_multiple());
   return finder.sums;
 }
 

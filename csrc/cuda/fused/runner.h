@@ -447,7 +447,7 @@ class FusedRunner {
   // position at the start of the step, relative to the patch's first vertex (cluster: the mesh's)
   Quad<T>* origin_;
   Plane<T>* planes_;
-  Ball<T>* spheres_;
+  Sphere<T>* spheres_;
   Inputs<T> in_;
   Contacts<T> contacts_;
   OwnHalo halo_;            // cluster

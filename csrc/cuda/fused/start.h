@@ -33,7 +33,7 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::lay_o
   v_ = {array(array_x), array(array_velocity), array(array_target), array(array_u),
         array(array_before)};
   origin_ = array(array_origin);
-  spheres_ = reinterpret_cast<Ball<T>*>(entries_ + (Clustered ? 2 : 1) * plan_.most_entries);
+  spheres_ = reinterpret_cast<Sphere<T>*>(entries_ + (Clustered ? 2 : 1) * plan_.most_entries);
   planes_ = reinterpret_cast<Plane<T>*>(spheres_ + call_.material.spheres_count);
 }
 
@@ -78,7 +78,7 @@ template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InSha
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::move_spheres() {
   if constexpr (!HasContacts) return;
   __syncthreads();
-  for (int b = threadIdx.x; b < contacts_.ball_count; b += blockDim.x)
+  for (int b = threadIdx.x; b < contacts_.sphere_count; b += blockDim.x)
     spheres_[b].center = spheres_[b].center + spheres_[b].motion;
   __syncthreads();
 }

@@ -36,7 +36,7 @@ struct MultilevelMemory {
   double* chunk_dots;              // [teams, 2, most_sums, chunks], double-buffered
   double* patch_sums;              // [teams, patches, sums_count]
   Range* ranges;                   // [teams, 2, blocks, ranges_count], double-buffered
-  Misfit* misfit;                  // [batch]
+  MaterialMismatch* mismatch;      // [batch]
   unsigned* counter;               // [teams], zero at the launch
 };
 
@@ -69,8 +69,8 @@ static_assert(small_multilevel_threads % (most_parts * warp_size) == 0 &&
 
 // State of a block in shared memory; its first thread updates it.
 struct MultilevelControl {
-  Outer outer;
-  Pairs pairs;
+  LineSearch outer;
+  SecantPairs pairs;
   double total[most_sums];
   double factor[history];  // coefficients of s_j in the direction
   // of passes; also the cycle's partial sums

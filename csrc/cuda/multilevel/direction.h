@@ -55,7 +55,7 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::precondition() {
 template <class T, bool HasContacts, int Threads>
 PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::corotate() {
   const TurningPlan plan(iteration_, builds_, c_.outer.restarts - restarts_at_build_, HasContacts,
-                         c_.outer.turns());
+                         c_.outer.rebuilds_coarse());
   const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, iterate_, w_.weights};
   if (plan.forget) corotated_ = false;
   if (plan.make) {
@@ -65,7 +65,7 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::corotate() {
     contacts_current_ = false;
     team_ = make_corotation(in, m_.corotation, team_, shared_, call_.shared_corotation,
                             c_.outer.scale, corotation_.with_plan(call_.plan()));
-    if (threadIdx.x == 0) c_.outer.strayed = 0;
+    if (threadIdx.x == 0) c_.outer.path_since_coarse = 0;
   }
   if constexpr (HasContacts) {
     if (corotated_ && !contacts_current_)

@@ -40,10 +40,10 @@ __global__ void __launch_bounds__(multilevel_threads)
   Range* const ranges = of_team(call, number).ranges;
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
     const StreamWork<T, false> w(call.stream, e);
-    MisfitRunner<T> run(w, ranges, team);
+    MismatchRunner<T> run(w, ranges, team);
     const T* stiffness = call.stream.step.material.stiffness.of(e);
-    const Misfit misfit = measure_misfit(run, w.plan.levels, stiffness);
-    if (team.thread() == 0) call.memory.misfit[e] = misfit;
+    const MaterialMismatch mismatch = measure_mismatch(run, w.plan.levels, stiffness);
+    if (team.thread() == 0) call.memory.mismatch[e] = mismatch;
   }
 }
 
@@ -183,7 +183,7 @@ MultilevelMemory<T> arrange(Arena& arena, const MultilevelCall<T>& call) {
   arena.place(m.chunk_dots, teams * 2 * call.chunks() * most_sums);
   arena.place(m.patch_sums, teams * step.plan.patches * sums_count);
   arena.place(m.ranges, teams * 2 * call.blocks * ranges_count);
-  arena.place(m.misfit, step.batch);
+  arena.place(m.mismatch, step.batch);
   return m;
 }
 

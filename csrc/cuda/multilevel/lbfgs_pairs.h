@@ -1,4 +1,4 @@
-// The two loops of L-BFGS over secant pairs (Pairs, solver/multilevel/lbfgs.h) by one warp, one pair per
+// The two loops of L-BFGS over secant pairs (SecantPairs, solver/multilevel/lbfgs.h) by one warp, one pair per
 // lane. The operations on every number and their order are unchanged; the dependency chain is 8
 // steps long instead of 36.
 #pragma once
@@ -10,14 +10,14 @@ namespace pd::inline PD_TARGET {
 // Called by a whole warp; lanes from `history` on repeat others.
 class SecantPairLanes {
  public:
-  PD_DEVICE SecantPairLanes(Pairs& pairs, int newest)
+  PD_DEVICE SecantPairLanes(SecantPairs& pairs, int newest)
       : pairs_(pairs), newest_(newest), own_(int(threadIdx.x) % history) {}
 
   PD_DEVICE void first_loop() {
     Numbers n;
 #pragma unroll
     for (int a = 0; a < history; ++a) load(a, pairs_.product[own_][place(a)], n);
-    double rest = pairs_.pulled[own_];
+    double rest = pairs_.s_dot_g[own_];
 #pragma unroll
     for (int a = 0; a < history; ++a) {
       const double alpha = n.valid[a] ? broadcast(rest, place(a)) * n.inverse[a] : 0;
@@ -56,13 +56,13 @@ class SecantPairLanes {
     n.valid[a] = pairs_.valid[place(a)];
     n.product[a] = product;
   }
-  PD_DEVICE int place(int age) const { return Pairs::older(newest_, age); }
+  PD_DEVICE int place(int age) const { return SecantPairs::older(newest_, age); }
   PD_DEVICE int age() const { return (newest_ - own_ + history) % history; }
   PD_DEVICE static double broadcast(double value, int from) {
     return __shfl_sync(full_warp, value, from);
   }
 
-  Pairs& pairs_;
+  SecantPairs& pairs_;
   int newest_, own_;
 };
 

@@ -1,4 +1,4 @@
-// Runs measure_misfit of solver/multilevel/material_mismatch.h on a GPU.
+// Runs measure_mismatch of solver/multilevel/material_mismatch.h on a GPU.
 #pragma once
 #include "cuda/multilevel/runner.h"
 
@@ -6,9 +6,9 @@ namespace pd::inline PD_TARGET {
 
 // Called by all threads of a team.
 template <class T>
-class MisfitRunner {
+class MismatchRunner {
  public:
-  PD_DEVICE MisfitRunner(const StreamWork<T, false>& w, Range* memory, BlockTeam& team)
+  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, Range* memory, BlockTeam& team)
       : w_(w), memory_(memory), team_(team) {}
 
   template <class Visit>
@@ -24,7 +24,7 @@ class MisfitRunner {
       visit(i, double(w_.v.inertia(i)));
   }
 
-  PD_DEVICE void meet(Range (&range)[ranges_count]) {
+  PD_DEVICE void reduce(Range (&range)[ranges_count]) {
     __shared__ double least[ranges_count][warp_size], largest[ranges_count][warp_size];
     const int lane = threadIdx.x % warp_size, warp = threadIdx.x / warp_size;
     __syncthreads();  // the previous round has read the shared arrays

@@ -29,16 +29,16 @@ class MultilevelRunner {
         lbfgs_(call.stream.step.settings.learns()),
         corotates_(call.shared_corotation > 0),
         corotation_(call.plan().vertices, memory.corotation, shared + call.shared_corotation) {
-    const Misfit& misfit = m_.misfit[environment];
-    outliers_ = {misfit.strangers, T(misfit.trusted)};
+    const MaterialMismatch& mismatch = m_.mismatch[environment];
+    outliers_ = {mismatch.has_outliers, T(mismatch.trusted)};
     if (threadIdx.x == 0) {
       const bool stops = w_.settings().tolerance > 0;
-      c_.outer.begin(misfit, HasContacts, w_.contacts.friction() > T(0), corotates_,
-                     energy_noise<T>(), stops ? w_.progress.stop.fall : 0);
+      c_.outer.begin(mismatch, HasContacts, w_.contacts.friction() > T(0), corotates_,
+                     energy_noise<T>(), stops ? w_.progress.stop.free_fall : 0);
       c_.pairs = {};
       c_.done = false;
     }
-    if (is_first()) w_.progress.schedule.rho = misfit.spread;
+    if (is_first()) w_.progress.schedule.rho = mismatch.spread;
     __syncthreads();
   }
 
@@ -69,7 +69,7 @@ class MultilevelRunner {
 
   // Decides whether to accept the trial. Every block reduces the same sums, so all blocks decide
   // alike.
-  PD_DEVICE void judge(int) {
+  PD_DEVICE void accept_or_reject(int) {
     // adds the patches' sums to those of the shared vertices
     double sum[2] = {patch_sum_[0], patch_sum_[1]};
     warp_reduce_sums(sum);
@@ -97,11 +97,11 @@ class MultilevelRunner {
 
   // Adds the secant pair from the iterate to the trial, accepted or not: it describes the curvature
   // in between.
-  PD_DEVICE void learn(int k) {
+  PD_DEVICE void update_pairs(int k) {
     if (threadIdx.x < warp_size) {
       if (lbfgs_) store_pair(k);
       if (threadIdx.x == 0) {
-        c_.outer.walk(c_.total[dots_change]);
+        c_.outer.add_path(c_.total[dots_change]);
         stop(k, c_.total[dots_change], c_.total[dots_displacement]);
       }
       __syncwarp();
@@ -110,21 +110,22 @@ class MultilevelRunner {
     __syncthreads();
   }
 
-  PD_DEVICE bool goes_by_diagonal() const { return lbfgs_ && c_.outer.diagonal; }
+  PD_DEVICE bool uses_jacobi() const { return lbfgs_ && c_.outer.jacobi; }
 
   PD_DEVICE void precondition();  // cuda/multilevel/direction.h
 
   // Computes the next trial, projected out of the contacts: u + beta (u - before) - (1 + beta) t d,
   // or a Jacobi iteration, plain or accelerated.
-  PD_DEVICE void advance() {
+  PD_DEVICE void next_trial() {
     __syncthreads();
     if (threadIdx.x == 0)
-      c_.total[0] = c_.outer.send(w_.progress.schedule.limit, lbfgs_, corotated_,
-                                  corotates_ && builds_ == 0, has_contact_springs());
+      c_.total[0] = c_.outer.propose(w_.progress.schedule.limit, lbfgs_, corotated_,
+                                     corotates_ && builds_ == 0, has_contact_springs());
     ++used_;
     __syncthreads();
-    const bool accelerates = c_.outer.accelerates(), falls_back = accelerates || c_.outer.plain;
-    const T beta = T(c_.total[0]), length = T((1 + c_.total[0]) * c_.outer.length());
+    const bool accelerates = c_.outer.accelerates(),
+               falls_back = accelerates || c_.outer.plain_jacobi;
+    const T beta = T(c_.total[0]), length = T((1 + c_.total[0]) * c_.outer.trial_length());
     const T theta = T(w_.settings().relaxation);
     const bool moved = c_.accepted;
     each_vertex([&](int i) {
@@ -139,7 +140,7 @@ class MultilevelRunner {
       const Vec3<T> next =
           falls_back
               ? at.jacobi(w_.contacts, before, slope, accelerates, theta, T(1) + beta)
-              : v.land(
+              : v.project_trial(
                     w_.contacts,
                     at.iterate - completed(i, length * direction(i) - beta * (at.iterate - before)),
                     at.iterate, slope);
@@ -154,7 +155,7 @@ class MultilevelRunner {
   }
 
   // Returns the last trial if it was accepted, else the iterate; NaN if the energy is not finite.
-  PD_DEVICE void settle() {
+  PD_DEVICE void keep_best() {
     const T lost = c_.outer.energy < HUGE_VAL ? T(0) : T(NAN);
     const Vec3<T> none = {lost, lost, lost};
     if (!c_.accepted || !(lost == T(0)))
@@ -182,11 +183,11 @@ class MultilevelRunner {
                                  const Vec3<T>& force, ThreadSums& sums) const {
     const auto& v = loaded.vertex;
     sums.value[0] += loaded.energy();
-    m_.trial_residual[i] = quad(v.unbalanced(w_.contacts, loaded.u, force));
+    m_.trial_residual[i] = quad(v.residual(w_.contacts, loaded.u, force));
     if constexpr (HasContacts) {
-      const Leeway<T> left = v.leeway(w_.contacts, loaded.u, force);
+      const ContactProjector<T> left = v.contact_projector(w_.contacts, loaded.u, force);
       m_.trial_free[i] = left.free;
-      m_.trial_friction[i] = quad(v.friction(left.taken));
+      m_.trial_friction[i] = quad(v.friction_force(left.slip));
       m_.trial_gradient[i] = quad(v.gradient(loaded.u, force));
       // work against the friction of the iterate
       if (!c_.outer.known) return;
@@ -328,24 +329,25 @@ class MultilevelRunner {
   PD_DEVICE void stop(int k, double change, double displacement) {
     const double tolerance = w_.settings().tolerance;
     if (!(tolerance > 0) || k == 0) return;
-    c_.done = c_.outer.ends(tolerance, w_.progress.schedule, change, displacement);
+    c_.done = c_.outer.is_met(tolerance, w_.progress.schedule, change, displacement);
   }
 
   // Called by one warp, one lane per secant pair.
   PD_DEVICE void store_pair(int k) {
     const int j = int(threadIdx.x);
-    Pairs& pairs = c_.pairs;
+    SecantPairs& pairs = c_.pairs;
     if (j < history) {
       pairs.product[j][newest_] = c_.total[dots_sy + j];
       if (c_.accepted) {
-        pairs.pulled[j] = c_.total[dots_sg + j];
+        pairs.s_dot_g[j] = c_.total[dots_sg + j];
       } else if (j == newest_) {
-        pairs.pulled[j] = c_.total[dots_s_residual];
+        pairs.s_dot_g[j] = c_.total[dots_s_residual];
       }
     }
     if (j != 0) return;
-    pairs.admit(newest_, k > 0 && c_.outer.teaches(), c_.total[dots_change], c_.total[dots_yy]);
-    if (c_.outer.forgets()) pairs.clear();
+    pairs.admit(newest_, k > 0 && c_.outer.updates_pairs(), c_.total[dots_change],
+                c_.total[dots_yy]);
+    if (c_.outer.clears_pairs()) pairs.clear();
   }
 
   PD_DEVICE void accept_contact_state(int i) const {
@@ -372,7 +374,7 @@ class MultilevelRunner {
   PD_DEVICE bool is_outlier(int i) const {
     if (!(w_.plan.levels.fine_inverse[i] > T(0))) return true;
     return w_.v.inertia(i) >
-           T(known_inertia) * w_.plan.levels.reference_inertia[i] * outliers_.trusted;
+           T(outlier_ratio) * w_.plan.levels.reference_inertia[i] * outliers_.trusted;
   }
   PD_DEVICE Vec3<T> restricted(int i, const Vec3<T>& field) const {
     return trial_vertex(w_.v.at(i), i).restricted(field);

@@ -268,10 +268,10 @@ class DeviceCycle {
   PD_DEVICE static Vec3<T> prolongated(const Level<B, T>& level, const Quad<T>* below, int row,
                                        int i, int lane) {
     const auto read = [&](int p, int number, Entry<4>& entry) {
-      entry.from = below + std::int64_t(level.lift_node[p]) * 4;
-      read_quad(level.lift_weight, std::int64_t(p) * B + number, entry.factor);
+      entry.from = below + std::int64_t(level.prolongation_node[p]) * 4;
+      read_quad(level.prolongation_weight, std::int64_t(p) * B + number, entry.factor);
     };
-    return sum_of<prolongation_lanes<B>, 2, 4>(level.lift_start, row, i, lane, read);
+    return sum_of<prolongation_lanes<B>, 2, 4>(level.prolongation_start, row, i, lane, read);
   }
 
   // z += F y
@@ -302,7 +302,7 @@ class DeviceCycle {
   template <int B>
   PD_DEVICE void restrict_to(const Level<B, T>& level, const LevelFields<T>& f, Quad<T>* in,
                              Quad<T>* initial) {
-    const std::int64_t entries = std::int64_t(level.lift_start[level.rows]) * B;
+    const std::int64_t entries = std::int64_t(level.prolongation_start[level.rows]) * B;
     int parts = 1;
     while (parts < most_parts &&
            entries > std::int64_t(parts) * level.nodes * warp_size * most_entries_per_lane)

@@ -175,7 +175,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, HasContacts> v, Contacts<T> contacts,
   };
   const auto at = [&](int i) { return wide(vec3(v.x[i])) + wide(vec3(v.u[i])); };
   const auto sum_mean = [&] {
-    double sum[S::lag] = {};
+    double sum[S::target_offset] = {};
     part.each([&](int i) { add_mean(sum, double(v.inertia(i)), at(i)); });
     return write_shares(sum, Add{}, to + PartSums::rigid);
   };
@@ -184,7 +184,7 @@ PD_DEVICE_COLD void sum_part(Vertices<T, HasContacts> v, Contacts<T> contacts,
     double sum[StartSums::count] = {}, back[3] = {};
     part.each([&](int i) {
       const auto vertex = v.at(i);
-      const Vec3<T> u = vec3(v.u[i]), still = vertex.still(contacts);
+      const Vec3<T> u = vec3(v.u[i]), still = vertex.current_iterate(contacts);
       add_start(sum, contacts, vertex.x, vertex.target, vertex.inertia, vertex.inverse, u, still,
                 u - v.predicted(i, settings));
       const Vec3<double> way = double(vertex.inertia) * (wide(still) - wide(u));
@@ -200,18 +200,18 @@ PD_DEVICE_COLD void sum_part(Vertices<T, HasContacts> v, Contacts<T> contacts,
     Vec3<double> center;
     if (how.at_once()) {
       const double own = sum_mean();
-      double sum[S::lag];
-      for (int n = 0; n < S::lag; ++n) sum[n] = __shfl_sync(full_warp, own, n);
+      double sum[S::target_offset];
+      for (int n = 0; n < S::target_offset; ++n) sum[n] = __shfl_sync(full_warp, own, n);
       center = center_of(sum);
     } else {
       center = piece.center;
     }
-    double sum[S::pins - S::lag] = {}, held[S::count - S::pins] = {};
+    double sum[S::pins - S::target_offset] = {}, held[S::count - S::pins] = {};
     part.each([&](int i) {
-      const Vec3<T> lag = vec3(v.target[i]) - vec3(v.u[i]);
-      add_moments(sum, double(v.inertia(i)), at(i) - center, wide(lag));
+      const Vec3<T> target_offset = vec3(v.target[i]) - vec3(v.u[i]);
+      add_moments(sum, double(v.inertia(i)), at(i) - center, wide(target_offset));
     });
-    write_shares(sum, Add{}, to + PartSums::rigid + S::lag);
+    write_shares(sum, Add{}, to + PartSums::rigid + S::target_offset);
     if (!how.pins) return;
     part.each([&](int i) { add_pin(held, double(v.inertia(i)), at(i) - center); });
     write_shares(held, Add{}, to + PartSums::rigid + S::pins);
@@ -367,7 +367,7 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
     return;
   }
   if constexpr (What == Rigid::start) {
-    reduce_over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    reduce_over_parts<S::target_offset>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     reduce_over_parts<PartSums::starts>(plan, piece, part_sum, Add{}, PartSums::start, to.start);
     if (!leader) return;
     double sum[StartSums::count];
@@ -376,13 +376,14 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Contacts<T>
     for (int n = 0; n < 3 && to.still; ++n) to.sum[S::position + n] += to.start[PartSums::back + n];
     to.center = center_of(to.sum);
   } else if constexpr (What == Rigid::mean) {
-    reduce_over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    reduce_over_parts<S::target_offset>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
     if (leader) to.center = center_of(to.sum);
   } else if constexpr (What == Rigid::free) {
     if (how.at_once())
-      reduce_over_parts<S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
-    reduce_over_parts<S::pins - S::lag>(plan, piece, part_sum, Add{}, PartSums::rigid + S::lag,
-                                        to.sum + S::lag);
+      reduce_over_parts<S::target_offset>(plan, piece, part_sum, Add{}, PartSums::rigid, to.sum);
+    reduce_over_parts<S::pins - S::target_offset>(plan, piece, part_sum, Add{},
+                                                  PartSums::rigid + S::target_offset,
+                                                  to.sum + S::target_offset);
     if (how.pins)
       reduce_over_parts<S::count - S::pins>(plan, piece, part_sum, Add{}, PartSums::rigid + S::pins,
                                             to.sum + S::pins);

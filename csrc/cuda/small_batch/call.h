@@ -55,7 +55,7 @@ struct SmallBatchLayout {
     entries = vectors + 5 * sizeof(Quad<T>) * slots;
     energies = entries + sizeof(Quad<T>) * many * plan.most_entries;
     contacts = aligned(energies + sizeof(T) * (many * plan.most_pairs + sums_count * slots));
-    bytes = contacts + many * (step.material.spheres_count * sizeof(Ball<T>) +
+    bytes = contacts + many * (step.material.spheres_count * sizeof(Sphere<T>) +
                                step.material.planes_count * sizeof(Plane<T>));
   }
 };

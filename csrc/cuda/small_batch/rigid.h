@@ -32,7 +32,7 @@ struct SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread, FewRegister
     r.each_slot([&](const WorkItem& item, int i) {
       const int number = r.plan_.slot_piece[item.at];
       if (number >= 0 && r.piece(item.environment, number).still)
-        r.v_.set(i, r.v_.at(i).still(r.contacts(item.environment)));
+        r.v_.set(i, r.v_.at(i).current_iterate(r.contacts(item.environment)));
     });
     __syncthreads();
   }
@@ -61,7 +61,7 @@ PD_DEVICE void SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread,
   Aligning how(plan_, HasContacts, first);
   Rounds rounds{*this};
   do {
-    find_in_rounds<HasContacts>(rounds, how, contacts(0).has_several());
+    find_in_rounds<HasContacts>(rounds, how, contacts(0).has_multiple());
     each_slot([&](const WorkItem& item, int i) {
       const int number = plan_.slot_piece[item.at];
       if (number < 0 || !(v_.u[i].w > 0)) return;  // of no free piece, or pinned

@@ -51,7 +51,7 @@ class SmallBatchRunner {
     entries_ = reinterpret_cast<Quad<T>*>(shared + layout.entries);
     pair_energy_ = reinterpret_cast<T*>(shared + layout.energies);
     vertex_sum_ = pair_energy_ + call.per_block * plan_.most_pairs;
-    spheres_ = reinterpret_cast<Ball<T>*>(shared + layout.contacts);
+    spheres_ = reinterpret_cast<Sphere<T>*>(shared + layout.contacts);
     planes_ = reinterpret_cast<Plane<T>*>(spheres_ + call.per_block * call_.material.spheres_count);
     vertex_sums_ = all;
     first_pair_ = item_of(threadIdx.x, pairs());
@@ -409,7 +409,7 @@ class SmallBatchRunner {
   Vertices<T, HasContacts> v_;
   T *pair_energy_, *vertex_sum_;  // of all environments; the latter once per VertexSum
   int vertex_sums_;
-  Ball<T>* spheres_;
+  Sphere<T>* spheres_;
   Plane<T>* planes_;
   WorkItem first_pair_, first_slot_;  // of this thread
   PairInputs<T> pair_;                // its next pair

@@ -30,7 +30,7 @@ struct StreamMemory {
   double* part_sum;       // [batch, parts, PartSums::count]
   unsigned* counter;      // [batch] barrier counters of the teams that move pieces
   Plane<T>* planes;       // [batch, planes]
-  Ball<T>* spheres;       // [batch, spheres]
+  Sphere<T>* spheres;     // [batch, spheres]
 };
 
 template <class T>
@@ -312,7 +312,7 @@ __global__ void __launch_bounds__(decide_threads)
     p.done = soft && p.ends(set.tolerance, omega[k % guard_period], total[1], total[2]);
     const auto set_omega = [&](int next) { omega[next % guard_period] = p.schedule.next(next); };
     set_omega(k + 1);
-    if (p.schedule.wants_energy(k)) p.schedule.check(total[0]);
+    if (p.schedule.checks_energy(k)) p.schedule.check(total[0]);
     // without a tolerance, all iterations until the next energy check
     for (int next = k + 2; !soft && next <= k + guard_period; ++next) set_omega(next);
   }
@@ -349,7 +349,7 @@ __global__ void __launch_bounds__(vertex_threads)
   if constexpr (What == VertexTask::load && HasContacts) {
     if (i == 0)
       w.in.read_contacts(const_cast<Plane<T>*>(w.contacts.planes),
-                         const_cast<Ball<T>*>(w.contacts.balls));
+                         const_cast<Sphere<T>*>(w.contacts.spheres));
   }
   if (i >= w.plan.vertices) return;
   if constexpr (What == VertexTask::load) w.v.init(i, w.in, i, w.h);
@@ -392,8 +392,8 @@ __global__ void __launch_bounds__(vertex_threads)
   const StreamWork<T, true> w(call, e);
   if constexpr (What == EnvironmentTask::store) w.in.write_info(record, w.progress);
   if constexpr (What == EnvironmentTask::move_spheres) {
-    Ball<T>* spheres = const_cast<Ball<T>*>(w.contacts.balls);
-    for (int b = 0; b < w.contacts.ball_count; ++b)
+    Sphere<T>* spheres = const_cast<Sphere<T>*>(w.contacts.spheres);
+    for (int b = 0; b < w.contacts.sphere_count; ++b)
       spheres[b].center = spheres[b].center + spheres[b].motion;
   }
 }

@@ -26,7 +26,7 @@ class StreamRounds {
 
   PD_DEVICE void run(Aligning how) {
     do {
-      find_in_rounds<HasContacts>(*this, how, w_.contacts.has_several());
+      find_in_rounds<HasContacts>(*this, how, w_.contacts.has_multiple());
       each_vertex([&](int i, const Piece<T>& piece) {
         if (!(w_.v.u[i].w > 0)) return;  // pinned
         const Vec3<T> u = w_.v.moved(i, piece.motion);
@@ -52,7 +52,7 @@ class StreamRounds {
 
   PD_DEVICE void begin_still() {
     each_vertex([&](int i, const Piece<T>& piece) {
-      if (piece.still) w_.v.set(i, w_.v.at(i).still(w_.contacts));
+      if (piece.still) w_.v.set(i, w_.v.at(i).current_iterate(w_.contacts));
     });
   }
 

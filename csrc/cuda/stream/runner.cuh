@@ -150,7 +150,7 @@ class StreamRunner {
     if (checks || set_.tolerance > 0) decide<Decision::iterate>(k);
   }
 
-  void descend() { run_multilevel(call_, multilevel_, stream_); }
+  void minimise() { run_multilevel(call_, multilevel_, stream_); }
 
   // always false, since a query would synchronise; converged environments skip the kernels instead
   bool finished() const { return false; }

@@ -1,9 +1,9 @@
-// The ops of free-form patches: schemas, and the CPU behind them.
+// The ops of free-form patches: schemas, and their CPU implementation.
 //
-// Compiled once, for any processor: the work is gathers and sums over a few quadrics, which registers of more than four
+// Compiled once, for any processor. The work is gathers and sums over a few quadrics, which wider vectors than four
 // numbers hardly speed up.
 #if defined(__x86_64__)
-#define PD_NO_FMA  // x86-64 has it only since AVX2, and a call to the library would be slow
+#define PD_NO_FMA  // x86-64 has it only since AVX2, and a library call would be slow
 #endif
 #define PD_TARGET freeform_cpu
 #include "freeform/binding/ops.h"

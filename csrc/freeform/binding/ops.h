@@ -1,4 +1,4 @@
-// What every op of free-form patches does on either device.
+// Common parts of the ops of free-form patches on either device.
 //
 // A Backend has `run(task, count, like)`, which computes the items of a task on the device of the tensor `like`.
 #pragma once

@@ -1,4 +1,4 @@
-// What carries the surface along, on either device: checks, views, the tasks one after another.
+// Deformation gradients and frames, on either device: checks, views, the tasks one after another.
 #pragma once
 #include "freeform/binding/checks.h"
 

@@ -31,7 +31,7 @@ void add_slots(MeshPlan& plan, const Numbering& n, const std::int64_t* tets,
   plan.patch_slot.push_back(std::int32_t(plan.slot_vertex.size()));
 }
 
-// Blocks of one patch. Neighbours go to different blocks, so that the lanes of a block seldom add to the same vertex.
+// Blocks of one patch. Neighbours go to different blocks, so that lanes of a block rarely add to the same vertex.
 void add_blocks(MeshPlan& plan, const double* x, const std::int64_t* tets,
                 std::span<const std::int32_t> patch, const std::vector<std::int32_t>& slot_of) {
   const std::int64_t count = std::ssize(patch), blocks = (count + lanes - 1) / lanes;

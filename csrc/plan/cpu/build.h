@@ -14,8 +14,8 @@ struct MeshPlan {
   std::vector<std::int16_t> tet_corner;
 };
 
-// `positions` [vertices, 3] at rest, `tets` [count, 4] with positive volume, both checked by the caller.
-// `progress` hears the fraction done now and then.
+// `positions` [vertices, 3] at rest and `tets` [count, 4] with positive volume are checked by the caller. `progress`
+// is called with the fraction done now and then.
 MeshPlan build_plan(const double* positions, std::int64_t vertices, const std::int64_t* tets,
                     std::int64_t count, int patch_size,
                     const std::function<void(double)>& progress);

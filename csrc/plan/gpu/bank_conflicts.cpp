@@ -22,10 +22,10 @@ Candidate candidate_of(const std::vector<Pair>& pairs, std::size_t number) {
   return result;
 }
 
-// Eight lanes in the making.
+// A phase of eight lanes, being filled.
 class Phase {
  public:
-  // whether one more lane with this corner in this bank costs a pass
+  // 1 if one more lane with this corner in this bank costs a pass, else 0
   int cost(int corner, int bank) const { return longest_[corner][bank]; }
 
   void add(const Pair& pair) {
@@ -44,36 +44,36 @@ class Phase {
   int lanes_[5][banks] = {}, passes_[5] = {};
 };
 
-constexpr std::array<std::array<std::uint8_t, 3>, 6> turns = {
+constexpr std::array<std::array<std::uint8_t, 3>, 6> permutations = {
     {{0, 1, 2}, {1, 2, 0}, {2, 0, 1}, {0, 2, 1}, {2, 1, 0}, {1, 0, 2}}};
 
-// One way to write a pair down: a turn of its common face, and which tetrahedron comes first.
-struct Writing {
-  int cost = never, turn = 0;
+// One order of a pair: a permutation of its common face, and which tetrahedron comes first.
+struct PairOrder {
+  int cost = never, permutation = 0;
   bool exchanged = false;
 };
 
-// The cheapest, of those that cost less than `limit`.
-Writing best_writing(const Phase& phase, const Candidate& candidate, int limit) {
+// The cheapest order, if it costs less than `limit`.
+PairOrder best_order(const Phase& phase, const Candidate& candidate, int limit) {
   const auto& bank = candidate.bank;
   const int kept = phase.cost(3, bank[3]) + phase.cost(4, bank[4]);
   const int exchanged = candidate.single ? never : phase.cost(3, bank[4]) + phase.cost(4, bank[3]);
   const int apexes = std::min(kept, exchanged);
-  Writing best = {limit, 0, false};
-  for (int t = 0; t < int(turns.size()) && best.cost > apexes; ++t) {
-    const auto& turn = turns[t];
-    const int cost = apexes + phase.cost(0, bank[turn[0]]) + phase.cost(1, bank[turn[1]]) +
-                     phase.cost(2, bank[turn[2]]);
+  PairOrder best = {limit, 0, false};
+  for (int t = 0; t < int(permutations.size()) && best.cost > apexes; ++t) {
+    const auto& permutation = permutations[t];
+    const int cost = apexes + phase.cost(0, bank[permutation[0]]) +
+                     phase.cost(1, bank[permutation[1]]) + phase.cost(2, bank[permutation[2]]);
     if (cost < best.cost) best = {cost, t, exchanged < kept};
   }
   return best;
 }
 
-Pair rewritten(const Pair& pair, const Writing& writing) {
-  const auto& turn = turns[writing.turn];
+Pair reordered(const Pair& pair, const PairOrder& order) {
+  const auto& permutation = permutations[order.permutation];
   const auto& p = pair.corner;
-  Pair result = {pair.tet, {p[turn[0]], p[turn[1]], p[turn[2]], p[3], p[4]}};
-  if (writing.exchanged) {
+  Pair result = {pair.tet, {p[permutation[0]], p[permutation[1]], p[permutation[2]], p[3], p[4]}};
+  if (order.exchanged) {
     std::swap(result.tet[0], result.tet[1]);
     std::swap(result.corner[3], result.corner[4]);
   }
@@ -82,7 +82,7 @@ Pair rewritten(const Pair& pair, const Writing& writing) {
 
 }  // namespace
 
-void spread_banks(std::vector<Pair>& pairs) {
+void reduce_bank_conflicts(std::vector<Pair>& pairs) {
   std::vector<Candidate> waiting;
   std::vector<Pair> ordered;
   for (std::size_t i = 0; i < pairs.size(); ++i) waiting.push_back(candidate_of(pairs, i));
@@ -90,15 +90,15 @@ void spread_banks(std::vector<Pair>& pairs) {
   Phase phase;
   while (!waiting.empty()) {
     if (ordered.size() % phase_lanes == 0) phase = {};
-    Writing best;
+    PairOrder best;
     std::size_t chosen = 0;
     for (std::size_t i = 0; i < waiting.size() && best.cost > 0; ++i) {
-      const Writing writing = best_writing(phase, waiting[i], best.cost);
-      if (writing.cost == best.cost) continue;
-      best = writing;
+      const PairOrder order = best_order(phase, waiting[i], best.cost);
+      if (order.cost == best.cost) continue;
+      best = order;
       chosen = i;
     }
-    ordered.push_back(rewritten(pairs[waiting[chosen].pair], best));
+    ordered.push_back(reordered(pairs[waiting[chosen].pair], best));
     phase.add(ordered.back());
     waiting[chosen] = waiting.back();
     waiting.pop_back();
@@ -132,7 +132,7 @@ std::int32_t EntryChoice::take(int corner, int lane, std::int32_t slot) {
   const auto entry_in = [&](int q) { return first_[slot] + entry_slice * row[q]; };
   const int most_half = *std::max_element(half.begin(), half.end());
   const int most_warp = *std::max_element(warp.begin(), warp.end());
-  // passes more, then lanes met, then the rows that are left
+  // additional passes, then conflicting lanes, then the rows that are left
   const auto cost = [&](int q) {
     const int e = entry_in(q), met_half = half[e % 16], met_warp = warp[e % 32];
     return std::array<int, 3>{(met_half == most_half) + (met_warp == most_warp),

@@ -1,4 +1,5 @@
-// Orders the pairs of a patch, and the entries of their forces, so that a warp seldom meets itself in a bank of shared memory.
+// Orders the pairs of a patch, and the entries of their forces, to reduce bank conflicts in a warp's shared memory
+// accesses.
 #pragma once
 
 #include "plan/gpu/pairing.h"
@@ -9,17 +10,18 @@
 
 namespace pd {
 
-// A warp moves one corner, 16 bytes a lane, in four phases of 8 lanes; a phase takes as many passes as lanes meet in a bank,
-// and slots with the same remainder by 8 do, as do their entries. `corner` of the pairs are slots. Changes the order of
-// pairs, of the corners of their common face, and of their two tetrahedra.
-void spread_banks(std::vector<Pair>& pairs);
+// A warp accesses one corner, 16 bytes a lane, in four phases of 8 lanes. A phase takes as many passes as lanes
+// conflict in a bank; slots with the same remainder by 8 conflict, and so do their entries. The corners of `pairs`
+// are slots. This changes the order of pairs, of the corners of their common face, and of their two tetrahedra.
+void reduce_bank_conflicts(std::vector<Pair>& pairs);
 
-// Slots whose entries lie in rows: that of a slot in the next row is so many further.
+// Slots per slice; the entries of a slot lie so many places apart.
 constexpr int entry_slice = 8;
 
-// In a pipeline (cuda/stream/pipeline.h) entries are numbers of 8 and of 4 bytes. Half a warp moves the former at once, in 16 banks, and
-// a warp the latter, in 32. So of the slices that a warp reads in a row, four, each begins in another quarter of the banks, and
-// of two neighbours one in either half: `next` is the first such place from `entry` on. Rows left out are 1 in 16.
+// Entries of a pipeline (cuda/stream/pipeline.h) are numbers of 8 and of 4 bytes. Half a warp accesses the former at once,
+// in 16 banks, and a warp the latter, in 32. So each of the four slices that a warp reads in a row begins in another
+// quarter of the banks, and neighbours begin in different halves. `next` is the first such place from `entry` on. It
+// leaves out 1 row in 16.
 class SliceBanks {
  public:
   std::int64_t next(std::int64_t entry);
@@ -27,11 +29,12 @@ class SliceBanks {
  private:
   int count_ = 0;  // slices so far, of a warp's four
   std::array<bool, 4> taken_ = {};
-  int last_ = 0;  // the quarter of the slice before
+  int last_ = 0;  // the quarter of the previous slice
 };
 
-// Which of its entries a slot gives the next pair. `spread`: one whose banks the fewest lanes have written to with the same corner,
-// else in the order of pairs. Blocks of 32 lanes come one after another, lanes in order.
+// Chooses the entry that a slot gives to the next pair. With `spread` its bank is the one that the fewest lanes have
+// written with the same corner; else entries follow the order of pairs. Blocks of 32 lanes come in turn, lanes in
+// order.
 class EntryChoice {
  public:
   EntryChoice(const std::vector<std::int32_t>& first, const std::vector<std::int32_t>& forces,
@@ -43,7 +46,7 @@ class EntryChoice {
   static constexpr int quarters = 4;
   const std::vector<std::int32_t>&first_, &forces_;
   bool spread_;
-  // of every slot, the next row not taken of those with each remainder by four; without `spread` the first counts all
+  // for every slot, the next free row for each remainder by four; without `spread` the first counts all
   std::vector<std::array<std::int32_t, quarters>> row_;
   // lanes of the block that have written to each bank
   struct Written {

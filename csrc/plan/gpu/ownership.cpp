@@ -76,7 +76,7 @@ class Owners {
   }
 
  private:
-  // Where tetrahedra of vertices on the left are to those on the right as patches are, with a vertex for every patch.
+  // The cut with tetrahedra left and right in the ratio of their patches, and at least one vertex for every patch.
   std::int64_t split(std::span<const std::int32_t> cut, int left, int patches) const {
     std::int64_t all = 0, sum = 0;
     for (const std::int32_t v : cut) all += weight_[v];
@@ -88,7 +88,7 @@ class Owners {
   std::vector<Point> points_;
   std::vector<std::int64_t> weight_, start_;  // tetrahedra of each vertex; where at_ has them
   std::vector<std::int32_t> at_;
-  std::vector<std::int64_t> seen_;  // round in which a tetrahedron was met last
+  std::vector<std::int64_t> seen_;  // last round that met a tetrahedron
   std::int64_t round_ = 0;
 };
 

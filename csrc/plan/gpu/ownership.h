@@ -1,4 +1,4 @@
-// Cuts a mesh into patches that have no vertex in common: the first half of the plan of a cluster.
+// Cuts a mesh into patches that share no vertex: the first half of a cluster's plan.
 #pragma once
 
 #include "plan/mesh/partition.h"
@@ -8,14 +8,14 @@
 
 namespace pd {
 
-// Each patch has every tetrahedron that touches one of its own vertices, so that some are in several.
+// Each patch has every tetrahedron that touches one of its own vertices, so some tetrahedra are in several patches.
 struct Ownership {
   Partition mesh;
   std::vector<std::int32_t> owner;  // patch of each vertex
 };
 
-// Recursive bisection of vertices across the axis that leaves the busiest side the fewest tetrahedra, which takes time like
-// patches times tetrahedra. Up to `vertices` patches.
+// Recursive bisection of vertices across the axis that minimises the tetrahedra of the busier side. Its time grows
+// like patches times tetrahedra. Up to `vertices` patches.
 Ownership own_vertices(const double* positions, std::int64_t vertices, const std::int64_t* tets,
                        std::int64_t count, std::int64_t patches);
 

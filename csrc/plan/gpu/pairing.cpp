@@ -11,7 +11,7 @@ int place_of(const Corners& corners, std::int32_t wanted) {
   return int(std::find(corners.begin(), corners.end(), wanted) - corners.begin());
 }
 
-// Of every tetrahedron the one across the face opposite each corner, -1: none.
+// For every tetrahedron, the neighbour across the face opposite each corner, -1: none.
 std::vector<Corners> face_neighbours(const std::vector<Corners>& tets) {
   struct Face {
     std::uint64_t key = 0;
@@ -43,11 +43,11 @@ std::vector<Corners> face_neighbours(const std::vector<Corners>& tets) {
   return neighbour;
 }
 
-// A matching of neighbours: of every tetrahedron its partner, -1: none. Who has the fewest free neighbours chooses first,
-// and takes the neighbour with the fewest: less than one in a hundred stay alone.
+// A matching of neighbours: the partner of every tetrahedron, -1: none. The tetrahedron with the fewest free
+// neighbours chooses first, and takes the neighbour with the fewest. Less than one in a hundred stays single.
 std::vector<std::int32_t> match(const std::vector<Corners>& neighbour) {
   std::vector<std::int32_t> partner(neighbour.size(), -1), free(neighbour.size());
-  // by number of free neighbours; who has lost one since stands there again, further down
+  // by number of free neighbours; one that has lost a neighbour is queued again
   std::array<std::vector<std::int32_t>, 5> waiting;
   for (std::int32_t t = std::int32_t(free.size()) - 1; t >= 0; --t) {
     free[t] = 4 - std::int32_t(std::count(neighbour[t].begin(), neighbour[t].end(), -1));

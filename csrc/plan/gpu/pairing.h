@@ -9,7 +9,7 @@ namespace pd {
 
 using Corners = std::array<std::int32_t, 4>;
 
-// Tetrahedra (p0, p1, p2, p3) and (p0, p1, p2, p4). One that found no neighbour stands alone: tet[1] = -1, p4 = p3.
+// Tetrahedra (p0, p1, p2, p3) and (p0, p1, p2, p4). A single tetrahedron has tet[1] = -1 and p4 = p3.
 struct Pair {
   std::array<std::int32_t, 2> tet;
   std::array<std::int32_t, 5> corner;
@@ -18,7 +18,7 @@ struct Pair {
   int corners() const { return single() ? 4 : 5; }
 };
 
-// `tets` of one patch by vertices numbered below 2^21; `tet` of the pairs counts from 0 in their order.
+// Pairs the `tets` of one patch, with vertices numbered below 2^21; `tet` of the pairs counts in their order.
 std::vector<Pair> pair_tets(const std::vector<Corners>& tets);
 
 }  // namespace pd

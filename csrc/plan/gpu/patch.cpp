@@ -69,7 +69,7 @@ void count_entries(MeshPatch& patch) {
 // the first blocks.
 void order_pairs(MeshPatch& patch, int number, const Numbering& numbering) {
   patch.outer = std::ssize(patch.pairs);
-  if (patch.outer <= small_pairs) return spread_banks(patch.pairs);
+  if (patch.outer <= small_pairs) return reduce_bank_conflicts(patch.pairs);
   const auto is_outer = [&](const Pair& pair) {
     return std::any_of(pair.corner.begin(), pair.corner.end(), [&](std::int32_t s) {
       return !numbering.is_inside(number, patch.vertex[s]);
@@ -80,8 +80,8 @@ void order_pairs(MeshPatch& patch, int number, const Numbering& numbering) {
   patch.outer = std::min((inner - patch.pairs.begin() + lanes - 1) / lanes * lanes, patch.outer);
   std::vector<Pair> rest(patch.pairs.begin() + patch.outer, patch.pairs.end());
   patch.pairs.resize(patch.outer);
-  spread_banks(patch.pairs);
-  spread_banks(rest);
+  reduce_bank_conflicts(patch.pairs);
+  reduce_bank_conflicts(rest);
   patch.pairs.insert(patch.pairs.end(), rest.begin(), rest.end());
 }
 

@@ -1,4 +1,4 @@
-// How points are ordered for a recursive bisection.
+// Order of points for a recursive bisection.
 #pragma once
 
 #include <algorithm>
@@ -11,7 +11,7 @@ namespace pd {
 
 using Point = std::array<double, 3>;
 
-// The axes, that of the longest side of the box of some points first.
+// The axes by side length of the points' bounding box, longest first.
 inline std::array<int, 3> axes_by_length(std::span<const std::int32_t> items,
                                          const std::vector<Point>& points) {
   Point low = points[items[0]], high = low;
@@ -27,8 +27,8 @@ inline std::array<int, 3> axes_by_length(std::span<const std::int32_t> items,
   return axis;
 }
 
-// Along the first axis. A layer that is cut itself is cut across, and the last ties fall to the number, so that every platform
-// makes the same plan.
+// Order along the first axis, then the others, then by number, so that all platforms make the same plan. A layer that
+// is cut itself is thus cut across.
 inline auto along(const std::array<int, 3>& axis, const std::vector<Point>& points) {
   return [&](std::int32_t a, std::int32_t b) {
     for (const int c : axis) {

@@ -9,8 +9,8 @@ namespace pd {
 
 namespace {
 
-// The least coordinates of every tetrahedron's corners. Ordered by them, a cut shares the vertices on one side of it alone;
-// ordered by centres it shares some on either side.
+// The least coordinates of every tetrahedron's corners. With this order a cut shares only the vertices on one of its
+// sides; an order by centres shares some on both.
 std::vector<Point> low_corners(const double* x, const std::int64_t* tets, std::int64_t count) {
   std::vector<Point> low(count);
   for (std::int64_t t = 0; t < count; ++t) {
@@ -44,8 +44,9 @@ void divide(Partition& mesh, const std::vector<Point>& corners, std::int64_t beg
   divide(mesh, corners, middle, end, patches - left, grain);
 }
 
-// Shared vertices in an order that puts those of the same patches side by side: what one patch reads of another lies together
-// then. They follow the last patch of each, by which all forces on them are there. `shared` keeps its order otherwise.
+// Orders shared vertices so that those of the same patches are adjacent, and one patch reads another's in a run. The
+// sort key is the reversed list of patches: the last patch has all forces on them. `shared` keeps its order
+// otherwise.
 void gather_by_patches(const Partition& mesh, const std::int64_t* tets,
                        const std::vector<std::uint8_t>& is_shared,
                        std::vector<std::int64_t>& shared) {

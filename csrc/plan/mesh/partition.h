@@ -23,7 +23,7 @@ struct Partition {
 Partition partition_mesh(const double* positions, const std::int64_t* tets, std::int64_t count,
                          std::int64_t patches, std::int64_t grain);
 
-// Which vertices lie inside one patch, and which are shared; their internal numbers.
+// Which vertices are interior to one patch and which are shared, and their internal numbers.
 struct Numbering {
   std::vector<std::uint8_t> is_shared;     // user's numbers
   std::vector<std::int32_t> internal;      // user's number -> internal number
@@ -39,7 +39,7 @@ struct Numbering {
 
 Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::int64_t vertices);
 
-// For every shared vertex the slots that hold it, in patch order.
+// For every shared vertex its slots, in patch order.
 struct SharedSlots {
   std::vector<std::int32_t> start, slot;
 };

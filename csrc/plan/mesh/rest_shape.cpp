@@ -14,8 +14,9 @@ Vec3<double> row_of(const double* positions, std::int64_t vertex) {
   return {x[0], x[1], x[2]};
 }
 
-// Largest eigenvalue of a symmetric 3x3 matrix that is positive semidefinite, by Newton's method on its characteristic
-// polynomial, from above (its trace). Next to a multiple root that loses up to two thirds of the digits: singular values then.
+// Largest eigenvalue of a symmetric positive semidefinite 3x3 matrix, by Newton's method on its characteristic
+// polynomial, starting above at its trace. Near a multiple root that loses up to two thirds of the digits; there the
+// singular values replace it.
 double largest_eigenvalue(const Mat3<double>& a) {
   const Mat3<double> c = cofactor(a);
   const double trace = a.row[0].x + a.row[1].y + a.row[2].z;
@@ -62,7 +63,7 @@ std::array<double, 3 * (Corners - 2)> face_rest(const double* positions,
   const double p = 1 / length, q = -dot(first, second) / (length * area), r = length / area;
   std::array<double, 3 * (Corners - 2)> rest = {p, q, r};
   for (int c = 3; c < int(Corners); ++c) {
-    // where the apex stands along the axes of the face
+    // coordinates of the apex along the axes of the face
     const Vec3<double> apex = edge(c);
     const double along = dot(first, apex) / length;
     const double across = dot(cross(normal, first), apex) / (area * length);

@@ -13,10 +13,10 @@ namespace {
 
 constexpr int sweeps = 6;
 constexpr double weakest =
-    0.01;  // clip of the relative strength: no edge is more than 100 times its distance long
+    0.01;  // clip of the relative strength: an edge is at most 100 times its distance long
 constexpr double never = std::numeric_limits<double>::infinity();
 
-// Dijkstra's method from any number of sources; ties fall to the lower number, so that every platform agrees.
+// Dijkstra's method from any number of sources. Ties go to the lower number, so that all platforms agree.
 class Fronts {
  public:
   explicit Fronts(const Graph& graph) : graph_(graph) { clear(); }
@@ -59,7 +59,7 @@ class Fronts {
   std::priority_queue<Item, std::vector<Item>, std::greater<Item>> queue_;
 };
 
-// Every vertex to the nearest centre; a piece of the graph without one gets one.
+// Assigns every vertex to the nearest centre; a component without a centre gets one.
 void join_nearest(Fronts& fronts, std::vector<std::int32_t>& centres,
                   const std::vector<std::uint8_t>& left_out) {
   const auto anywhere = [](std::int32_t, std::int32_t) { return true; };
@@ -74,7 +74,7 @@ void join_nearest(Fronts& fronts, std::vector<std::int32_t>& centres,
   }
 }
 
-// Centres move to the vertex farthest from the border of their aggregate; without a border they stay.
+// Moves each centre to the vertex farthest from the border of its aggregate; without a border it stays.
 void centre(const Graph& graph, const std::vector<std::int32_t>& label, Fronts& depth,
             std::vector<std::int32_t>& centres) {
   depth.clear();
@@ -94,7 +94,7 @@ void centre(const Graph& graph, const std::vector<std::int32_t>& label, Fronts& 
   }
 }
 
-// Centres move to the vertex nearest to the middle of their aggregate in space.
+// Moves each centre to the vertex nearest to the centroid of its aggregate.
 void centre_in_space(const Positions& position, const std::vector<std::int32_t>& label,
                      std::vector<std::int32_t>& centres) {
   std::vector<std::array<double, 4>> sum(centres.size(), {0, 0, 0, 0});
@@ -148,7 +148,7 @@ Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplin
   return graph;
 }
 
-std::int32_t connected_pieces(const Graph& graph, const std::vector<std::uint8_t>& left_out) {
+std::int32_t connected_components(const Graph& graph, const std::vector<std::uint8_t>& left_out) {
   Fronts fronts(graph);
   std::vector<std::int32_t> centres;
   join_nearest(fronts, centres, left_out);
@@ -157,7 +157,7 @@ std::int32_t connected_pieces(const Graph& graph, const std::vector<std::uint8_t
 
 Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_out,
                      std::int32_t wanted) {
-  // neighbours in space have near numbers, so centres far apart in number are far apart
+  // neighbours in space have near numbers, so spacing the numbers spaces the centres
   std::vector<std::int32_t> candidates, centres;
   for (std::int32_t v = 0; v < graph.vertices(); ++v) {
     if (!left_out[v]) candidates.push_back(v);
@@ -188,7 +188,7 @@ Aggregates aggregate_far_apart(const Graph& graph, const std::vector<std::uint8_
     fronts.add_source(vertex, 0);
     fronts.advance([](std::int32_t, std::int32_t) { return true; });
   };
-  // a vertex at the rim rather than any
+  // start at a vertex on the rim
   if (const std::int32_t any = farthest(); any >= 0) {
     spread_from(any);
     const std::int32_t first = farthest();

@@ -1,4 +1,4 @@
-// Groups the vertices of a weighted graph into compact aggregates: Lloyd's method with distances along the graph.
+// Groups the vertices of a weighted graph into compact aggregates by Lloyd's method with distances along the graph.
 #pragma once
 
 #include <array>
@@ -24,12 +24,12 @@ struct Graph {
 // Lengths distance / clip(strength / q, 0.01, 1), q the upper quartile of all strengths.
 Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplings);
 
-// Pieces of the graph that no edge joins, `left_out` not counted.
-std::int32_t connected_pieces(const Graph& graph, const std::vector<std::uint8_t>& left_out);
+// Number of connected components of the graph without the vertices `left_out`.
+std::int32_t connected_components(const Graph& graph, const std::vector<std::uint8_t>& left_out);
 
-// Aggregate of each vertex, -1 where `left_out`, and their count: about `wanted`, more where the graph falls into more
-// pieces. Six sweeps: every vertex joins the centre that it is nearest to, then every centre moves to the vertex that lies
-// deepest in its aggregate.
+// Aggregate of each vertex, -1 where `left_out`, and their count: about `wanted`, more if the graph has more
+// components. Six sweeps: every vertex joins the nearest centre, then every centre moves to the deepest vertex of its
+// aggregate.
 struct Aggregates {
   std::vector<std::int32_t> of;
   std::int32_t count = 0;
@@ -40,12 +40,12 @@ Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_o
 
 using Positions = std::vector<std::array<double, 3>>;
 
-// For a few aggregates: centres begin as far from one another as can be, and move to the middle of their aggregate in space,
-// so that the aggregates part a body across.
+// The same for a few aggregates. Centres start as far apart as possible and move to the centroid of their aggregate,
+// so that the aggregates cut a body across.
 Aggregates aggregate_far_apart(const Graph& graph, const std::vector<std::uint8_t>& left_out,
                                const Positions& position, std::int32_t wanted);
 
-// How far each vertex is along the graph from the nearest of an aggregate, infinite where no way leads there.
+// Distance of each vertex along the graph to the nearest vertex of an aggregate; infinite without a path.
 std::vector<double> distances_to(const Graph& graph, const Aggregates& aggregates,
                                  std::int32_t aggregate);
 

@@ -11,7 +11,7 @@ namespace pd {
 
 namespace {
 
-// One row of a product in the making: its columns as they appear, and a dense block for each.
+// One row of a product in progress: its columns in order of appearance, and a dense block for each.
 class RowSum {
  public:
   RowSum(std::int32_t columns, std::int64_t block) : place_(columns, -1), block_(block) {}
@@ -25,7 +25,7 @@ class RowSum {
     return value_.data() + place_[column] * block_;
   }
 
-  // hands the row over in ascending order, and is empty then
+  // appends the row in ascending order and clears it
   void move_to(std::vector<std::int32_t>& column, std::vector<double>& value) {
     std::vector<std::int32_t>& ordered = ordered_;
     ordered = column_;
@@ -56,7 +56,7 @@ void add_product(const double* a, const double* b, int h, int k, int w, double* 
   }
 }
 
-// The rows that one thread has made.
+// The rows made by one thread.
 struct Part {
   std::vector<std::int32_t> length, column;
   std::vector<double> value;
@@ -130,8 +130,8 @@ void apply(const BlockMatrix& a, const std::vector<double>& x, std::vector<doubl
   });
 }
 
-// Written out, because a library's sums would depend on the number of threads, and with them the bits of every step.
-// Right-looking elimination of [A | I], four pivots at a time for the sake of the cache.
+// Written out, because a library's sums, and with them the bits of every step, would depend on the number of threads.
+// Right-looking elimination of [A | I], four pivots at a time for the cache.
 std::vector<double> inverse_cholesky_factor(std::vector<double> matrix, int n, int threads) {
   constexpr int strip = 4;
   std::vector<double> inverse(std::size_t(n) * n, 0.0);

@@ -1,4 +1,4 @@
-// Sparse matrices of small dense blocks: what the levels of a preconditioner are made of. In double, on the CPU.
+// Sparse matrices of small dense blocks, for the levels of a preconditioner. In double, on the CPU.
 #pragma once
 
 #include <cstdint>
@@ -16,10 +16,10 @@ struct BlockMatrix {
   std::int64_t block() const { return std::int64_t(height) * width; }
 };
 
-// a b. Every row adds up in the same order whatever the number of threads.
+// a b. Every row adds up in the same order for any number of threads.
 BlockMatrix multiply(const BlockMatrix& a, const BlockMatrix& b, int threads);
 
-// The transposed matrix, and for each of its blocks where it stood in `a`.
+// The transposed matrix, and the place of each of its blocks in `a`.
 struct Transposed {
   BlockMatrix matrix;
   std::vector<std::int32_t> from;

@@ -17,13 +17,13 @@ namespace {
 
 constexpr int functions = 4;                        // 1, x, y, z
 constexpr int most_coarse_nodes = 256;              // 1024 unknowns of the dense level
-constexpr std::int32_t most_of_two_levels = 12000;  // free vertices that two levels serve
+constexpr std::int32_t most_of_two_levels = 12000;  // two levels serve up to so many free vertices
 constexpr double fine_smoothing = 1.14, middle_smoothing = 1.333;  // omega of I - omega D^-1 A
-constexpr double weakest_coupling = 0.02;  // of middle nodes, of their scaled blocks
-constexpr int turning_groups = 4;          // as many as solver/multilevel/deflation.h has
-constexpr double turning_reach = 2;     // how far groups overlap, in mean depths of their vertices
-constexpr double coarse_shift = 1e-12;  // of the diagonal: above what rounding takes from a pivot
-constexpr double dependent = 1e-8;  // what orthogonalisation leaves of a column that adds nothing
+constexpr double weakest_coupling = 0.02;  // relative to the scaled blocks of middle nodes
+constexpr int turning_groups = 4;          // as in solver/multilevel/deflation.h
+constexpr double turning_reach = 2;        // overlap of groups, in mean depths of their vertices
+constexpr double coarse_shift = 1e-12;  // relative to the diagonal: above the rounding of a pivot
+constexpr double dependent = 1e-8;      // orthogonalisation leaves less of a dependent column
 
 // Diagonal of a matrix of square blocks.
 std::vector<double> diagonal(const BlockMatrix& a) {
@@ -38,7 +38,7 @@ std::vector<double> diagonal(const BlockMatrix& a) {
   return d;
 }
 
-// Edges of a matrix: how large its blocks are beside the diagonal (Frobenius), where more than `least`.
+// Edges of a matrix: Frobenius norms of its blocks, scaled by the diagonal, where larger than `least`.
 std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>& d,
                                 const std::vector<std::array<double, 3>>& centre, double least) {
   std::vector<Coupling> found;
@@ -65,7 +65,8 @@ std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>&
   return found;
 }
 
-// Makes the four columns of q [rows, 4] orthonormal, or zero where they depend on those before; q R is what they were.
+// Orthonormalises the four columns of q [rows, 4]; a dependent column becomes zero. Returns R of the factorisation q
+// R.
 std::array<double, 16> orthonormalise(std::vector<double>& q) {
   std::array<double, 16> r{};
   const std::size_t rows = q.size() / functions;
@@ -91,10 +92,10 @@ std::array<double, 16> orthonormalise(std::vector<double>& q) {
   return r;
 }
 
-// Functions that every aggregate can represent: [rows, height, 4] in, orthonormal for each aggregate out.
+// The tentative prolongation: candidates [rows, height, 4], made orthonormal on each aggregate.
 struct Tentative {
-  BlockMatrix lift;             // one block a row
-  std::vector<double> reduced;  // R [aggregates, 4, 4]: the functions of the next level
+  BlockMatrix prolongation;     // one block a row
+  std::vector<double> reduced;  // R [aggregates, 4, 4]: the candidates of the next level
 };
 
 Tentative tentative(const std::vector<double>& candidates, int height, const Aggregates& groups) {
@@ -105,11 +106,11 @@ Tentative tentative(const std::vector<double>& candidates, int height, const Agg
   for (std::int32_t i = 0; i < rows; ++i) {
     if (groups.of[i] >= 0) {
       members[groups.of[i]].push_back(i);
-      t.lift.column.push_back(groups.of[i]);
+      t.prolongation.column.push_back(groups.of[i]);
     }
-    t.lift.start.push_back(std::int32_t(t.lift.column.size()));
+    t.prolongation.start.push_back(std::int32_t(t.prolongation.column.size()));
   }
-  t.lift.value.resize(t.lift.column.size() * block);
+  t.prolongation.value.resize(t.prolongation.column.size() * block);
   std::vector<double> q;
   for (const auto& member : members) {
     q.clear();
@@ -119,8 +120,9 @@ Tentative tentative(const std::vector<double>& candidates, int height, const Agg
     const auto r = orthonormalise(q);
     t.reduced.insert(t.reduced.end(), r.begin(), r.end());
     for (std::size_t k = 0; k < member.size(); ++k)
-      std::copy_n(q.begin() + k * block, block,
-                  t.lift.value.begin() + std::int64_t(t.lift.start[member[k]]) * block);
+      std::copy_n(
+          q.begin() + k * block, block,
+          t.prolongation.value.begin() + std::int64_t(t.prolongation.start[member[k]]) * block);
   }
   return t;
 }
@@ -128,22 +130,25 @@ Tentative tentative(const std::vector<double>& candidates, int height, const Agg
 // (I - omega D^-1 A) P
 BlockMatrix smoothed(const BlockMatrix& a, const std::vector<double>& inverse, double omega,
                      const BlockMatrix& p, int threads) {
-  BlockMatrix lift = multiply(a, p, threads);
-  const std::int64_t block = lift.block();
-  for (std::int32_t row = 0; row < lift.rows; ++row) {
-    for (std::int32_t e = lift.start[row]; e < lift.start[row + 1]; ++e) {
-      const bool own = p.start[row] < p.start[row + 1] && p.column[p.start[row]] == lift.column[e];
+  BlockMatrix prolongation = multiply(a, p, threads);
+  const std::int64_t block = prolongation.block();
+  for (std::int32_t row = 0; row < prolongation.rows; ++row) {
+    for (std::int32_t e = prolongation.start[row]; e < prolongation.start[row + 1]; ++e) {
+      const bool own =
+          p.start[row] < p.start[row + 1] && p.column[p.start[row]] == prolongation.column[e];
       for (std::int64_t k = 0; k < block; ++k) {
-        const double scale = omega * inverse[std::size_t(row) * lift.height + k / functions];
+        const double scale =
+            omega * inverse[std::size_t(row) * prolongation.height + k / functions];
         const double kept = own ? p.value[p.start[row] * block + k] : 0;
-        lift.value[e * block + k] = kept - scale * lift.value[e * block + k];
+        prolongation.value[e * block + k] = kept - scale * prolongation.value[e * block + k];
       }
     }
   }
-  return lift;
+  return prolongation;
 }
 
-// 1 / (lambda_max diag A), lambda_max of diag(A)^-1 A by power iteration and 5 % more; 0 where there is no function.
+// 1 / (lambda_max diag A), with lambda_max of diag(A)^-1 A from power iteration plus 5 %; 0 where there is no
+// function.
 std::vector<double> scaled_inverse(const BlockMatrix& a, int threads) {
   const std::vector<double> d = diagonal(a);
   std::vector<double> x(d.size()), y;
@@ -173,7 +178,7 @@ std::vector<double> scaled_inverse(const BlockMatrix& a, int threads) {
   return inverse;
 }
 
-// Neighbouring numbers put together, where the graph falls into more pieces than the dense level can hold.
+// Merges aggregates of neighbouring numbers, if the graph has more components than the dense level can hold.
 Aggregates limited(Aggregates groups, std::int32_t most) {
   if (groups.count <= most) return groups;
   for (std::int32_t& g : groups.of)
@@ -182,7 +187,7 @@ Aggregates limited(Aggregates groups, std::int32_t most) {
   return groups;
 }
 
-// L^-1 of a matrix L L^T, row by row up to the diagonal; nothing in the rows of what is held.
+// L^-1 of a matrix L L^T, row by row up to the diagonal; the rows of held vertices are zero.
 std::vector<double> coarse_factor(const BlockMatrix& a, const Mask& held, int threads) {
   const int n = a.rows * a.height;
   std::vector<double> dense(std::size_t(n) * n, 0.0);
@@ -206,12 +211,12 @@ std::vector<double> coarse_factor(const BlockMatrix& a, const Mask& held, int th
   return factor;
 }
 
-BlockMatrix galerkin(const BlockMatrix& a, const BlockMatrix& lift, const Transposed& transposed,
-                     int threads) {
-  return multiply(transposed.matrix, multiply(a, lift, threads), threads);
+BlockMatrix galerkin(const BlockMatrix& a, const BlockMatrix& prolongation,
+                     const Transposed& transposed, int threads) {
+  return multiply(transposed.matrix, multiply(a, prolongation, threads), threads);
 }
 
-// Rest positions in internal order, and the affine functions on them, of the size of one.
+// Rest positions in internal order, and the affine functions on them, scaled to the size of one.
 struct Affine {
   std::vector<std::array<double, 3>> position;
   std::vector<double> candidates;  // [vertices, 4]
@@ -252,19 +257,19 @@ std::vector<std::array<double, 3>> mean_positions(
   return mean;
 }
 
-// How a level is lifted from the one below, and the matrix of the one below.
+// The prolongation from the level below, its transpose, and the matrix of that level.
 struct Step {
-  BlockMatrix lift;
+  BlockMatrix prolongation;
   Transposed restriction;
   BlockMatrix coarse;
 };
 
 Step coarsen(const BlockMatrix& matrix, const std::vector<double>& inverse, double omega,
-             const BlockMatrix& tentative_lift, int threads) {
+             const BlockMatrix& tentative_prolongation, int threads) {
   Step step;
-  step.lift = smoothed(matrix, inverse, omega, tentative_lift, threads);
-  step.restriction = transpose(step.lift);
-  step.coarse = galerkin(matrix, step.lift, step.restriction, threads);
+  step.prolongation = smoothed(matrix, inverse, omega, tentative_prolongation, threads);
+  step.restriction = transpose(step.prolongation);
+  step.coarse = galerkin(matrix, step.prolongation, step.restriction, threads);
   return step;
 }
 
@@ -279,7 +284,7 @@ BlockMatrix scaled(BlockMatrix m, double factor, const std::vector<double>& scal
   return m;
 }
 
-// sum += m, of which `sum` has all blocks
+// sum += m, where `sum` has all blocks of m
 void add_to(BlockMatrix& sum, const BlockMatrix& m) {
   for (std::int32_t row = 0; row < m.rows; ++row) {
     std::int32_t to = sum.start[row];
@@ -292,22 +297,23 @@ void add_to(BlockMatrix& sum, const BlockMatrix& m) {
   }
 }
 
-// (I - S A) P, S = (keep first + second) D^-1 - second first D^-1 A D^-1 being what a level smooths by.
+// (I - S A) P with a level's smoother S = (keep first + second) D^-1 - second first D^-1 A D^-1.
 BlockMatrix folded(const BlockMatrix& a, const std::vector<double>& inverse, const BlockMatrix& p,
                    int threads) {
   constexpr double once = Smoother::keep * Smoother::first + Smoother::second;
   constexpr double twice = Smoother::second * Smoother::first;
   const BlockMatrix image = multiply(a, p, threads);
-  BlockMatrix lift = scaled(multiply(a, scaled(image, twice, inverse), threads), 1, inverse);
-  add_to(lift, scaled(image, -once, inverse));
-  add_to(lift, p);
-  return lift;
+  BlockMatrix prolongation =
+      scaled(multiply(a, scaled(image, twice, inverse), threads), 1, inverse);
+  add_to(prolongation, scaled(image, -once, inverse));
+  add_to(prolongation, p);
+  return prolongation;
 }
 
-// Lifts as a GPU has them, and their transposes.
+// Folds smoothing into the prolongation and its transpose, as a GPU needs it.
 void fold(Step& step, const BlockMatrix& a, const std::vector<double>& inverse, int threads) {
-  step.lift = folded(a, inverse, step.lift, threads);
-  step.restriction = transpose(step.lift);
+  step.prolongation = folded(a, inverse, step.prolongation, threads);
+  step.restriction = transpose(step.prolongation);
 }
 
 // The nodes below the middle level.
@@ -319,7 +325,8 @@ Aggregates group_nodes(const BlockMatrix& matrix,
   return limited(aggregate(graph, Mask(matrix.rows, 0), wanted), most_coarse_nodes);
 }
 
-// Four groups of vertices that overlap: 1 inside, falling to nothing a way off, over the sum of all. [vertices, 4]
+// Partition of unity [vertices, 4] of four overlapping groups: 1 inside, falling to 0 over a distance, divided by the
+// sum.
 std::vector<double> turning_weights(const Graph& graph, const Mask& held,
                                     const Positions& position) {
   const std::int32_t vertices = graph.vertices();
@@ -327,7 +334,7 @@ std::vector<double> turning_weights(const Graph& graph, const Mask& held,
       limited(aggregate_far_apart(graph, held, position, turning_groups), turning_groups);
   std::array<std::vector<double>, turning_groups> distance;
   for (int g = 0; g < turning_groups; ++g) distance[g] = distances_to(graph, groups, g);
-  // how deep vertices lie in their group, in the mean
+  // mean depth of vertices in their group
   double depth = 0, count = 0;
   for (std::int32_t v = 0; v < vertices; ++v) {
     double least = HUGE_VAL;
@@ -361,7 +368,7 @@ void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<dou
   value = std::move(matrix.value);
 }
 
-// Of the transposed matrix: where its values stand in the other, or these values, too.
+// Stores the transposed prolongation: with the places of its values in the other, or with the `values` themselves.
 void store_nodes(Step& step, bool values, Numbers& start, Numbers& row, Numbers& from,
                  std::vector<double>& value) {
   start = std::move(step.restriction.matrix.start);
@@ -370,9 +377,9 @@ void store_nodes(Step& step, bool values, Numbers& start, Numbers& row, Numbers&
     from = std::move(step.restriction.from);
     return;
   }
-  const std::int64_t block = step.lift.block();
+  const std::int64_t block = step.prolongation.block();
   for (const std::int32_t e : step.restriction.from) {
-    const auto first = step.lift.value.begin() + e * block;
+    const auto first = step.prolongation.value.begin() + e * block;
     value.insert(value.end(), first, first + block);
   }
 }
@@ -397,7 +404,7 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   if (scene.vertices <= scene.most_direct) {
     t.level_sizes[level_direct] = 1;
     t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
-    t.fine_lift_start.assign(std::size_t(scene.vertices) + 1, 0);
+    t.fine_prolongation_start.assign(std::size_t(scene.vertices) + 1, 0);
     t.fine_node_start = {0};
     store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
     progress(1.0);
@@ -405,21 +412,22 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   }
   const auto free = std::int32_t(std::count(fine.held.begin(), fine.held.end(), 0));
   const bool middle =
-      free > most_of_two_levels || connected_pieces(graph, fine.held) > most_coarse_nodes;
+      free > most_of_two_levels || connected_components(graph, fine.held) > most_coarse_nodes;
   const std::int32_t nodes = std::max(1, free / (free < 1000 ? 15 : 30));
   const Aggregates groups =
       aggregate(graph, fine.held, middle ? nodes : std::min(nodes, most_coarse_nodes));
   progress(0.5);
 
   const Tentative first = tentative(rest.candidates, 1, groups);
-  Step step = coarsen(fine.matrix, t.fine_inverse, fine_smoothing, first.lift, threads);
+  Step step = coarsen(fine.matrix, t.fine_inverse, fine_smoothing, first.prolongation, threads);
   if (scene.folded) fold(step, fine.matrix, t.fine_inverse, threads);
-  t.level_sizes[level_fine_lifts] = step.lift.start.back();
+  t.level_sizes[level_fine_prolongations] = step.prolongation.start.back();
   t.level_sizes[level_fine_nodes] = groups.count;
   store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
-  store_nodes(step, scene.folded, t.fine_node_start, t.fine_node_row, t.fine_node_lift,
+  store_nodes(step, scene.folded, t.fine_node_start, t.fine_node_row, t.fine_node_prolongation,
               t.fine_node_weight);
-  store(step.lift, t.fine_lift_start, t.fine_lift_node, t.fine_lift_weight);
+  store(step.prolongation, t.fine_prolongation_start, t.fine_prolongation_node,
+        t.fine_prolongation_weight);
   progress(0.7);
 
   BlockMatrix coarse = std::move(step.coarse);
@@ -427,15 +435,16 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
     t.middle_inverse = scaled_inverse(coarse, threads);
     const Aggregates last = group_nodes(coarse, mean_positions(rest.position, groups));
     const Tentative second = tentative(first.reduced, functions, last);
-    step = coarsen(coarse, t.middle_inverse, middle_smoothing, second.lift, threads);
+    step = coarsen(coarse, t.middle_inverse, middle_smoothing, second.prolongation, threads);
     if (scene.folded) fold(step, coarse, t.middle_inverse, threads);
     t.level_sizes[level_middle_entries] = coarse.start.back();
-    t.level_sizes[level_middle_lifts] = step.lift.start.back();
+    t.level_sizes[level_middle_prolongations] = step.prolongation.start.back();
     t.level_sizes[level_middle_nodes] = last.count;
     store(coarse, t.middle_start, t.middle_column, t.middle_value);
-    store_nodes(step, scene.folded, t.middle_node_start, t.middle_node_row, t.middle_node_lift,
-                t.middle_node_weight);
-    store(step.lift, t.middle_lift_start, t.middle_lift_node, t.middle_lift_weight);
+    store_nodes(step, scene.folded, t.middle_node_start, t.middle_node_row,
+                t.middle_node_prolongation, t.middle_node_weight);
+    store(step.prolongation, t.middle_prolongation_start, t.middle_prolongation_node,
+          t.middle_prolongation_weight);
     coarse = std::move(step.coarse);
   }
   progress(0.8);

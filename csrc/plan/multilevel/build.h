@@ -1,7 +1,8 @@
-// Prepares the multilevel approximation of A^-1 for a scene: the arrays of views/multilevel.def.
+// Builds the multilevel approximation of A^-1 for a scene: the arrays of multilevel.def.
 //
-// A = diag(a) + sum_e w_e V_e grad N grad N^T is constant, so all of this happens once. Smoothed aggregation (Vanek, Mandel
-// and Brezina 1996) with the affine functions as near-nullspace: pieces that move rigidly, or strain evenly, cost nothing.
+// A = diag(a) + sum_e w_e V_e grad N grad N^T is constant, so this happens once. The method is smoothed aggregation
+// (Vanek, Mandel and Brezina 1996) with the affine functions as near-nullspace. They represent rigid motions and
+// uniform strains of an aggregate exactly.
 #pragma once
 
 #include "views/views.h"
@@ -12,7 +13,7 @@
 
 namespace pd {
 
-// The scene, checked by the caller, in the user's numbers but for `vertex_order` (internal number -> user's number).
+// The scene, checked by the caller; in the user's numbers but for `vertex_order` (internal number -> user's number).
 struct MultilevelScene {
   const double* positions;  // [vertices, 3] at rest
   std::int64_t vertices;
@@ -21,11 +22,11 @@ struct MultilevelScene {
   const std::int32_t* vertex_order;  // [vertices]
   const double* stiffness;           // [count] Pa
   const double* inertia;             // [vertices] a, inf where a pin holds the vertex exactly [N/m]
-  std::int64_t most_direct;          // vertices of a mesh that needs no levels: M is A^-1 itself
-  bool folded;                       // lifts as a GPU has them
+  std::int64_t most_direct;  // largest mesh without levels, where M is A^-1 itself [vertices]
+  bool folded;               // prolongation with smoothing folded in, for a GPU
 };
 
-// The table as vectors.
+// The table's arrays as vectors.
 struct MultilevelTables {
   using real = double;
 #define X(name, type, width, rows, meaning) std::vector<type> name;
@@ -33,7 +34,7 @@ struct MultilevelTables {
 #undef X
 };
 
-// `progress` hears the fraction done now and then. The same bits for any number of threads.
+// Reports the fraction done to `progress` now and then. The result has the same bits for any number of threads.
 MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
                                   const std::function<void(double)>& progress);
 

@@ -22,7 +22,7 @@ BlockMatrix incidence(const MultilevelScene& s, const std::vector<std::int32_t>&
   return transpose(corners).matrix;
 }
 
-// One row of A: inertia, and of every tetrahedron around w V grad N_i . grad N_j.
+// One row of A: inertia, plus w V grad N_i . grad N_j of every adjacent tetrahedron.
 struct Row {
   std::vector<std::pair<std::int32_t, double>> entry;
   double bound = 0;
@@ -54,7 +54,7 @@ void assemble_row(const MultilevelScene& s, const std::vector<std::int32_t>& int
       if (!held[internal[corner[k]]]) row.entry.emplace_back(internal[corner[k]], weight * dot);
     }
   }
-  // equal columns stand in the order of their tetrahedra, so that sums do not depend on the sort
+  // equal columns stay in the order of their tetrahedra, so that sums do not depend on the sort
   std::stable_sort(row.entry.begin(), row.entry.end(),
                    [](const auto& a, const auto& b) { return a.first < b.first; });
 }

@@ -1,4 +1,4 @@
-// The constant matrix of projective dynamics of a scene, assembled: what the multilevel preconditioner approximates.
+// Assembles the constant matrix of projective dynamics, which the multilevel preconditioner approximates.
 #pragma once
 
 #include "plan/multilevel/block_matrix.h"

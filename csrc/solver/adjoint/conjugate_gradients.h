@@ -1,9 +1,9 @@
-// Conjugate gradients (Hestenes and Stiefel 1952) on H l = b, H = P (a + K) P with the elastic Hessian K, preconditioned by
-// 1 / D, or by P M P where the plan has levels, with 1 / D on vertices of which M knows nothing. Where vertices slide against
-// friction H has what turns their slip besides (slide_across).
+// Conjugate gradients (Hestenes and Stiefel 1952) on H l = b, H = P (a + K) P with the elastic Hessian K. The
+// preconditioner is 1 / D, or P M P where the plan has levels, with 1 / D on vertices that M does not know. Where
+// vertices slide against friction, H has the term of the slip's rotation too (slide_across).
 //
-// P leaves out vertices that do not move, and of others what contacts do not let through. D is one number a vertex, so P and
-// 1 / D commute, and all vectors stay where P leaves them.
+// P removes vertices that do not move, and the directions that contacts block. D is one number a vertex, so P and 1 /
+// D commute, and all vectors stay in the range of P.
 #pragma once
 #include "math/mat.h"
 #include "views/views.h"
@@ -31,13 +31,13 @@ struct Conjugate {
     to[progress_error] = error;
   }
 
-  // what they are of a right side so many times as large
+  // rescales for a right side so many times as large
   PD_HD void scale_by(double factor) {
     product *= factor * factor;
     scale *= factor;
   }
 
-  // by |b|^2, plus zero times every position, and b . z, z = b / D or M b
+  // Takes |b|^2, plus zero times every position, and b . z with z = b / D or M b.
   PD_HD void begin(double square, double weighted) {
     scale = sqrt(square);
     product = weighted;
@@ -45,30 +45,31 @@ struct Conjugate {
     error = active ? 1 : scale;
   }
 
-  // how far to go along the direction; along one without positive curvature H is not positive, and what there is stays
+  // step length along the direction. Negative curvature means that H is not positive: the solve stops with what it
+  // has.
   PD_HD double step(double curvature) {
     active = curvature > 0;
     return active ? product / curvature : 0;
   }
 
-  // whether the residual r is not the end yet, by |r|^2
-  PD_HD void judge(double square, double tolerance) {
+  // whether the residual r needs more iterations, by |r|^2
+  PD_HD void check_residual(double square, double tolerance) {
     const double residual = sqrt(square);
     active = residual > tolerance * scale;
-    // what got lost on the way is an error, however large
+    // a NaN on the way is an error, however large
     error = residual < HUGE_VAL ? residual / scale : HUGE_VAL;
   }
 
-  // what of the last direction the next one keeps, by r . z
-  PD_HD double keep(double next) {
+  // factor of the last direction in the next one (beta), from r . z
+  PD_HD double direction_ratio(double next) {
     const double ratio = next / product;
     product = next;
     return ratio;
   }
 };
 
-// What vectors are solved for in: a power of two near the largest number of the residual, so that squares of theirs have room.
-// Neither it nor one over it is infinite or no normal number.
+// Unit of the solve: a power of two near the largest number of the residual, so that squares neither overflow nor
+// vanish. Both it and its reciprocal are finite, normal numbers.
 template <class T>
 PD_HD T unit_near(T largest) {
   if (!(largest > T(0) && largest < T(HUGE_VAL))) return T(1);
@@ -77,14 +78,15 @@ PD_HD T unit_near(T largest) {
   return T(ldexp(1.0, exponent > most ? most : exponent < -most ? -most : exponent));
 }
 
-// The part of a field that contacts let through. `projector`: nine numbers, or null.
+// Projects a field on the free directions. `projector`: nine numbers, or null.
 template <class T>
 PD_HD Vec3<T> project(const Vec3<T>& field, const T* p) {
   if (!p) return field;
   return Mat3<T>{{{p[0], p[1], p[2]}, {p[3], p[4], p[5]}, {p[6], p[7], p[8]}}} * field;
 }
 
-// P (a d + K d) of a vertex; `moves`: it has any part in P. `across`: slide_across, by which H has its square more; or null.
+// P (a d + K d) at a vertex; `moves`: P leaves it any direction. `across`: slide_across, whose outer product H has;
+// or null.
 template <class T>
 PD_HD Vec3<T> conjugate_image(const Vec3<T>& elastic, const Vec3<T>& direction, T inertia,
                               bool moves, const T* projector, const T* across) {
@@ -97,7 +99,7 @@ PD_HD Vec3<T> conjugate_image(const Vec3<T>& elastic, const Vec3<T>& direction, 
   return project(image, projector);
 }
 
-// z of a vertex with residual r: P M r, but r / D where it was held when M was made. `of_levels`: (M r) there.
+// z at a vertex with residual r: P M r, or r / D if M holds the vertex. `of_levels`: (M r) there.
 template <class T>
 PD_HD Vec3<T> preconditioned(const Vec3<T>& of_levels, const Vec3<T>& residual, T inverse,
                              T reference_inertia, const T* projector) {

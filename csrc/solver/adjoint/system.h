@@ -1,5 +1,5 @@
-// The system of a step's adjoint, H l = dL/dx' + dL/dv' / h on what moves, and what its solution says of the state before; see
-// torchpd/ops/adjoint.py. A vertex at a time, no neighbours.
+// The system of a step's adjoint, H l = dL/dx' + dL/dv' / h on the free directions, and the gradient by the state
+// before the step; see torchpd/ops/adjoint.py. One vertex at a time, without neighbours.
 #pragma once
 #include "contact/plane_sphere.h"
 #include "math/mat.h"
@@ -11,24 +11,25 @@ namespace pd::inline PD_TARGET {
 // Relative residual at which a solve stops: near the rounding floor of each precision.
 template <class T>
 constexpr double adjoint_tolerance = sizeof(T) == 4 ? 1e-5 : 1e-10;
-// times that, a solve has failed
+// A solve has failed above this multiple of the tolerance.
 constexpr double adjoint_failed = 1e3;
 constexpr int adjoint_iterations = 2000;  // at most
 
-// of what friction could take back: slip below it counts as none
-constexpr double sticking = 1e-3;
+// Slip below this share of what friction could take back counts as none.
+constexpr double sticking_tolerance = 1e-3;
 
-// A contact as a vertex meets it.
+// A contact at one vertex.
 template <class T>
 struct ContactAt {
-  int number;  // planes, then balls
+  int number;  // planes, then spheres
   Vec3<T> normal;
   T gap, friction;
   Vec3<T> motion;
-  T curved;  // 1 / its distance from the middle of a ball
+  T inverse_distance;  // 1 / distance to the centre of a sphere; 0 for planes
 };
 
-// What contacts do to a vertex of a solved step. One holds it when an unaccelerated iteration, x' - r / D, would end inside.
+// The contacts that hold a vertex of a solved step. A contact holds it if a plain iteration, x' - r / D, would
+// penetrate.
 template <class T>
 struct HeldVertex {
   Vec3<T> position;  // x'
@@ -36,114 +37,117 @@ struct HeldVertex {
   Vec3<T> residual;  // r, the gradient of the step's objective
   T diagonal;
 
-  // off the normals that hold it
+  // projector off the normals that hold it
   Mat3<T> projector = {{{T(1), T(0), T(0)}, {T(0), T(1), T(0)}, {T(0), T(0), T(1)}}};
   bool stuck = false;  // friction holds it
-  int sticks_to = -1;  // that of this contact, the last if there are several
-  T carried = T(1);    // and it goes so far as its start does, along the surface
-  T curvature = T(0);  // of the surface that it slides on, times the push
-  int contacts = 0;    // that hold it
+  int sticks_to = -1;  // friction of this contact, the last if there are several
+  T carried = T(1);    // its motion along the surface per motion of its start
+  T curvature = T(0);  // normal force times curvature of the surface that it slides on
+  int contacts = 0;    // holding contacts
   Vec3<T> first_normal = {};
   T first_friction = T(0);
   Vec3<T> slides[slide_count] = {};
 
-  // Returns whether it is held along a normal that earlier contacts do not span; where they have put it out of one that they span,
-  // that does nothing any more.
-  PD_HD bool touch(const ContactAt<T>& contact) {
+  // Returns whether the contact holds the vertex along a normal that earlier contacts do not span. A contact whose
+  // normal they span adds nothing.
+  PD_HD bool add_contact(const ContactAt<T>& contact) {
     const Vec3<T>&normal = contact.normal, &motion = contact.motion;
-    const T friction = contact.friction, curved = contact.curved;
-    const T push = dot(residual, normal);
-    if (!(push > T(0) && contact.gap < push / diagonal)) return false;
-    // so that all together are a projector
+    const T friction = contact.friction, inverse_distance = contact.inverse_distance;
+    const T normal_force = dot(residual, normal);
+    if (!(normal_force > T(0) && contact.gap < normal_force / diagonal)) return false;
+    // orthogonalised, so that the product stays a projector
     const Vec3<T> left = projector * normal;
     const T size = dot(left, left);
-    if (!(size > T(spanned))) return false;
-    projector = take_off(projector, left, T(1) / size);
+    if (!(size > T(dependent_normal))) return false;
+    projector = project_off(projector, left, T(1) / size);
     const Vec3<T> slip = tangential(moved - motion, normal);
     const T slipped = square_root(dot(slip, slip));
-    const bool sticks = friction > T(0) && holds(slipped, friction * push);
+    const bool sticks = friction > T(0) && holds(slipped, friction * normal_force);
     stuck = stuck || sticks;
     if (sticks) sticks_to = contact.number;
-    curvature = multiply_add(push, curved, curvature);
+    curvature = multiply_add(normal_force, inverse_distance, curvature);
     for (Vec3<T>& of : slides) of = {T(0), T(0), T(0)};
     ++contacts;
     carried = T(1);
     if (contacts == 1) {
       first_normal = normal;
       first_friction = friction;
-      // it ends where the line from the centre to its start, moved along, meets the ball
-      const T begins = T(1) - curved * dot(moved - motion, normal);
+      // its end is where the line from the centre to its start, moved along, meets the sphere
+      const T begins = T(1) - inverse_distance * dot(moved - motion, normal);
       if (sticks && begins > T(0)) carried = T(1) / begins;
       if (friction > T(0) && !sticks)
-        slide_on(normal, push, friction, motion, curved, slip, slipped);
+        slide_on(normal, normal_force, friction, motion, inverse_distance, slip, slipped);
     } else if (contacts == 2 && curvature == T(0)) {
       slide_along_edge(normal, friction);
     }
     return true;
   }
 
-  // what friction can take back in one iteration is more than what has slipped
-  PD_HD bool holds(T slipped, T most) const { return slipped * diagonal <= T(sticking) * most; }
+  // friction can take back more in one iteration than has slipped
+  PD_HD bool holds(T slipped, T most) const {
+    return slipped * diagonal <= T(sticking_tolerance) * most;
+  }
 
-  PD_HD void slide_on(const Vec3<T>& normal, T push, T friction, const Vec3<T>& motion, T curved,
-                      const Vec3<T>& slip, T slipped) {
+  PD_HD void slide_on(const Vec3<T>& normal, T normal_force, T friction, const Vec3<T>& motion,
+                      T inverse_distance, const Vec3<T>& slip, T slipped) {
     const T rate = T(1) / slipped, along = friction * rate;
     slides[slide_along] = along * slip;
     slides[slide_normal] = normal;
-    slides[slide_across] = (square_root(along * push) * rate) * cross(normal, slip);
-    slides[slide_bend] = (along * square_root(push * curved)) * slip;
-    slides[slide_lean] = (curved * dot(moved - motion, normal)) * slides[slide_across];
+    slides[slide_across] = (square_root(along * normal_force) * rate) * cross(normal, slip);
+    slides[slide_bend] = (along * square_root(normal_force * inverse_distance)) * slip;
+    slides[slide_lean] = (inverse_distance * dot(moved - motion, normal)) * slides[slide_across];
   }
 
-  // Between two planes, whose edge leaves a slip no other direction: the friction of both, of whose pushes r is made.
+  // Two planes, whose edge is the only direction of slip. Friction is the sum of both; r consists of their normal
+  // forces.
   PD_HD void slide_along_edge(const Vec3<T>& normal, T friction) {
     const T both = dot(first_normal, normal), share = T(1) / (T(1) - both * both);
     const Vec3<T> first = share * subtract_product(first_normal, both, normal);
     const Vec3<T> second = share * subtract_product(normal, both, first_normal);
-    const Vec3<T> rub = multiply_add(friction, second, first_friction * first);
+    const Vec3<T> friction_bound = multiply_add(friction, second, first_friction * first);
     const Vec3<T> slip = projector * moved;
-    const T slipped = square_root(dot(slip, slip)), force = dot(rub, residual);
-    if (!(force > T(0))) return;  // smooth ones
+    const T slipped = square_root(dot(slip, slip)), force = dot(friction_bound, residual);
+    if (!(force > T(0))) return;  // both are smooth
     stuck = stuck || holds(slipped, force);
     if (stuck) return;
     slides[slide_along] = (T(1) / slipped) * slip;
-    slides[slide_normal] = rub;
+    slides[slide_normal] = friction_bound;
   }
 };
 
 // adds(contact): of those by which `vertex` is held along one more normal.
 template <class T, class Adds>
-PD_HD void touch_all(HeldVertex<T>& vertex, const Material<T>& material, std::int64_t environment,
-                     const Adds& adds) {
+PD_HD void find_contacts(HeldVertex<T>& vertex, const Material<T>& material,
+                         std::int64_t environment, const Adds& adds) {
   const Vec3<T>& x = vertex.position;
-  const auto touch = [&](const ContactAt<T>& contact) {
-    if (vertex.touch(contact)) adds(contact);
+  const auto add_contact = [&](const ContactAt<T>& contact) {
+    if (vertex.add_contact(contact)) adds(contact);
   };
   for (int c = 0; c < material.planes_count; ++c) {
     const T* p = material.planes.of(environment) + planes_numbers * c;
     const Vec3<T> normal = {p[0], p[1], p[2]};
-    touch({c,
-           normal,
-           dot(normal, x) - p[planes_height],
-           p[planes_friction],
-           {T(0), T(0), T(0)},
-           T(0)});
+    add_contact({c,
+                 normal,
+                 dot(normal, x) - p[planes_height],
+                 p[planes_friction],
+                 {T(0), T(0), T(0)},
+                 T(0)});
   }
   for (int c = 0; c < material.spheres_count; ++c) {
     const T* p = material.spheres.of(environment) + spheres_numbers * c;
     const Vec3<T> offset = x - Vec3<T>{p[0], p[1], p[2]};
     const T length = square_root(dot(offset, offset));
     if (!(length > T(0))) continue;
-    touch({material.planes_count + c,
-           (T(1) / length) * offset,
-           length - p[spheres_radius],
-           p[spheres_friction],
-           {p[spheres_motion], p[spheres_motion + 1], p[spheres_motion + 2]},
-           T(1) / length});
+    add_contact({material.planes_count + c,
+                 (T(1) / length) * offset,
+                 length - p[spheres_radius],
+                 p[spheres_friction],
+                 {p[spheres_motion], p[spheres_motion + 1], p[spheres_motion + 2]},
+                 T(1) / length});
   }
 }
 
-// One vertex of one environment, by the user's number; `pin` holds it, or -1.
+// One vertex of one environment, by the user's number; `pin` is the pin that holds it, or -1.
 template <class T, class P>
 struct AdjointVertex {
   const AdjointSystemCall<T, P>& call;
@@ -173,7 +177,8 @@ struct AdjointVertex {
                           T(call.time_step));
   }
 
-  // r = m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - force + k (x' - pin) + elasticity; contacts do not enter
+  // r = m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - force + k (x' - pin) + elasticity; contacts do not
+  // enter
   PD_HD Vec3<T> residual(const Vec3<T>& after, const Vec3<T>& moved) const {
     const T h = T(call.time_step);
     const T* g = call.material.gravity.of(environment);
@@ -196,28 +201,29 @@ struct AdjointVertex {
   }
 
   // dL/dx' + dL/dv' / h
-  PD_HD Vec3<T> asked() const {
+  PD_HD Vec3<T> loss_gradient() const {
     return multiply_add(T(1) / T(call.time_step), read(call.grad_velocities),
                         read(call.grad_positions));
   }
 
-  // What contacts do to it; see touch_all.
+  // Finds the contacts that hold it; see find_contacts.
   template <class Adds>
   PD_HD HeldVertex<T> hold(T weight, const Adds& adds) const {
     const Vec3<T> after = read(call.after);
     HeldVertex<T> held{after, after - read(call.positions), {T(0), T(0), T(0)}, diagonal(weight)};
     if (moves(weight)) {
       held.residual = residual(after, held.moved);
-      touch_all(held, call.material, environment, adds);
+      find_contacts(held, call.material, environment, adds);
     }
     return held;
   }
 
-  // A vertex that a pin holds exactly, or friction, has no part in H: right side and 1 / D are zero.
-  PD_HD void solve_for() const {
+  // Writes the vertex's row of the system. A vertex held exactly, by a pin or by friction, gets zero right side and 1
+  // / D.
+  PD_HD void write_system() const {
     const T weight = inertia(spring()), all = diagonal(weight);
     const bool free = moves(weight);
-    Vec3<T> right = free ? asked() : Vec3<T>{T(0), T(0), T(0)};
+    Vec3<T> right = free ? loss_gradient() : Vec3<T>{T(0), T(0), T(0)};
     T kept = free ? weight : T(0), inverse = free ? T(1) / all : T(0);
     if (call.projector) {
       const HeldVertex<T> held = hold(weight, [](const ContactAt<T>&) {});
@@ -238,16 +244,16 @@ struct AdjointVertex {
         to[2] = slides.z;
       }
       kept = kept - held.curvature;
-      // with the turning of the slip, which H has
+      // with the rotation of the slip, which H has
       const Vec3<T>& across = held.slides[slide_across];
       if (free) inverse = T(1) / (all + dot(across, across));
       if (held.stuck) inverse = T(0);
       right = held.projector * right;
     }
-    // also where elasticity without bounds leaves no 1 / D
+    // also where an infinite stiffness leaves no 1 / D
     if (!(inverse != T(0))) right = {T(0), T(0), T(0)};
     write(call.right, right);
-    // what environments share is written once
+    // rows that environments share are written once
     if (environment == 0 || call.rows > 1) {
       const std::int64_t at = environment * call.plan.vertices + vertex;
       call.inertia[at] = kept;
@@ -256,11 +262,11 @@ struct AdjointVertex {
   }
 };
 
-// -l . dr / d(x, v) of a vertex: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l; one that friction holds moves
-// with its start, and l of one that slides has what its friction adds (solver/adjoint/friction.h), but where the solve has failed,
-// which leaves friction out. An environment whose solve could not begin has no number for an answer.
+// -l . dr / d(x, v) at a vertex: dL/dx = m / h^2 (1 + damping h) l - dL/dv' / h, dL/dv = m / h l. A vertex that
+// friction holds moves with its start. For one that slides, l has the friction term (solver/adjoint/friction.h),
+// unless that solve has failed. The result is NaN in an environment whose solve could not begin.
 template <class T>
-struct AdjointAnswer {
+struct AdjointResult {
   const AdjointResultCall<T>& call;
   std::int64_t environment, vertex;
 
@@ -278,7 +284,7 @@ struct AdjointAnswer {
     p[2] = a.z;
   }
 
-  PD_HD void give() const {
+  PD_HD void write() const {
     const T h = T(call.time_step), mass = call.masses.of(environment)[vertex];
     const double error = call.error[environment * call.error_stride];
     Vec3<T> multiplier = read(call.multiplier);
@@ -292,7 +298,7 @@ struct AdjointAnswer {
       sum = sum + free * (read(call.grad_positions) + before - read(call.elastic));
     }
     if (call.sliding && error <= adjoint_failed * adjoint_tolerance<T>) {
-      // the direction of slip turns with its start
+      // the direction of slip rotates with its start
       const T* p = call.sliding + 3 * (slide_count * at() + slide_across);
       const Vec3<T> across = {p[0], p[1], p[2]};
       sum = multiply_add(dot(across, multiplier), across, sum);

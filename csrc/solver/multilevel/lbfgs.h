@@ -1,29 +1,32 @@
 // A step by preconditioned L-BFGS, or by momentum: M approximates A^-1 by levels, see plan/multilevel/build.h.
 //
-// E lies below a quadratic with the constant matrix A (solver/step.h). With the material that M was made for, 0 < M A <= 1 up
-// to rounding, so u - theta M grad E with theta < 2 lowers E by at least theta (1 - theta / 2) g^T M g. With another one,
-// A <= s A_0 for the largest ratio s of its inertias and stiffnesses to those M was made for: theta M / s does.
-// What accelerates that step may overshoot, so every trial is judged by its energy before the next one starts from it.
-// Trials that fail go back, and after a few of them Jacobi iterations take over, which descend by the proof there, accelerated:
-// for a while with L-BFGS, which has learnt from the failures, and for the rest of the step with momentum, which has not. A while
-// is two iterations, then four, eight, and shorter again where M serves; with friction, unless there is the small problem below,
-// eight, then sixteen, after a single failure.
+// E lies below a quadratic with the constant matrix A (solver/step.h). With M's reference material, 0 < M A <= 1 up
+// to rounding. So u - theta M grad E with theta < 2 lowers E by at least theta (1 - theta / 2) g^T M g. For another
+// material let s be the largest ratio of its inertias and stiffnesses to the reference. Then A <= s A_0, and theta M
+// / s descends.
 //
-// Contacts hold vertices in directions that A does not know of. M is applied to what is out of balance in the others, and its
-// result taken in the others, while the held ones go by the diagonal (two-metric projection, Bertsekas 1982), as does a vertex
-// that a spring holds much harder than M knows. In them M is far too soft for motions of whole parts, by the ratio of stiffness
-// to inertia; the small problem of solver/multilevel/deflation.h takes those away and puts in what contacts make of them.
+// L-BFGS and momentum may overshoot, so every trial is accepted or rejected by its energy. After a few rejected
+// trials accelerated Jacobi iterations replace M; they descend by the proof there. With L-BFGS they end after some
+// iterations, since the pairs have learnt from the failures; with momentum they last for the rest of the step. The
+// number is 2, then 4, 8, and falls again after successes. With friction, and without the coarse problem, it is 8,
+// then 16, after one failure.
 //
-// With it trials of a body that lands fail for another reason: the direction is good until it takes a stiff face into a contact
-// that holds nothing yet, and bends it there. So they are shortened, to a thousandth and less where a face hovers within
-// micrometres, and the next one begins as short. Detours, never long, come where that fails, too, and with friction at first:
-// normal forces that have not settled drag stiff bodies far astray.
+// Contacts block directions that A does not know of. M is applied to the residual along the free directions, and its
+// result is used along them. The diagonal serves the blocked ones (two-metric projection, Bertsekas 1982), and
+// vertices with a spring much stiffer than in M. Along the free directions M is far too soft for motions of whole
+// parts, by the ratio of stiffness to inertia. The coarse problem of solver/multilevel/deflation.h replaces these, with
+// contacts included.
 //
-// Friction is that of Coulomb with the normal force of the base, so that within an iteration it has an energy, its bound times
-// the slip. Its force along the slip is part of what is out of balance; its work is part of the judgement; a trial goes no
-// further than to where a slip ends, since friction does not turn it round (as in OWL-QN, Andrew and Gao 2007); and where it
-// holds the direction of a slip harder than the body does, M is left the direction alone (contact/plane_sphere.h). Contacts that a
-// trial finds have no friction before the next one.
+// With the coarse problem trials of a landing body fail for another reason. The direction is good until it moves a
+// stiff face into a contact that is not active yet, and bends it there. So trials are shortened, to a thousandth and
+// less where a face hovers within micrometres, and the next one starts as short. Where that fails too, short Jacobi
+// fallbacks follow; with friction they come first, since unsettled normal forces drag stiff bodies far astray.
+//
+// Friction is Coulomb's with the normal force at the iterate. Within an iteration it has an energy, its bound times
+// the slip, whose work enters the acceptance test. Its force along the slip is part of the residual. A trial ends
+// where a slip ends, since friction does not reverse it (as in OWL-QN, Andrew and Gao 2007). Where friction resists
+// the rotation of a slip more than the body does, M acts along the slip alone (contact/plane_sphere.h). New contacts of a
+// trial have no friction before the next one.
 #pragma once
 #include "math/scalar.h"
 #include "solver/multilevel/line_search.h"
@@ -34,7 +37,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// The runner's own functions say where it runs: in a kernel, or on the host.
+// The runner's own functions say whether this runs in a kernel or on the host.
 #if defined(__CUDACC__)
 #pragma nv_exec_check_disable
 #endif
@@ -43,7 +46,7 @@ PD_HD void multilevel_step(Runner& run) {
   run.predict();
   run.start();
   run.align();
-  run.descend();  // multilevel_iterations
+  run.minimise();  // multilevel_iterations
   run.align();
   run.finish();
 }
@@ -54,36 +57,35 @@ PD_HD void multilevel_step(Runner& run) {
 template <class Runner>
 PD_HD void multilevel_iterations(Runner& run, const Settings& settings) {
   for (int k = 0;; ++k) {
-    run.evaluate(k);  // local step at the trial: its energy, and what is out of balance there
-    run.judge(k);     // go on from the trial, or back
+    run.evaluate(k);          // local step at the trial: energy and residual
+    run.accept_or_reject(k);  // accept the trial, or go back
     if (k == settings.iterations) break;
-    run.learn(k);  // what the way to it says about the curvature
+    run.update_pairs(k);  // secant pair of the trial
     if (run.finished()) break;
-    // direction: M, corrected by what was learnt
-    if (!run.goes_by_diagonal()) run.precondition();
-    run.advance();  // next trial, on the pins and out of the contacts
+    // direction: M, corrected by the secant pairs
+    if (!run.uses_jacobi()) run.precondition();
+    run.next_trial();  // next trial, on the pins and out of the contacts
   }
-  run.settle();  // on the last trial that was better
+  run.keep_best();  // the last accepted trial
 }
 
-constexpr int history = 8;                 // pairs that L-BFGS remembers
-constexpr double least_curvature = 1e-12;  // s.y of a pair, in |s| |y|
+constexpr int history = 8;                 // secant pairs that L-BFGS keeps
+constexpr double least_curvature = 1e-12;  // least s.y of a pair, relative to |s| |y|
 
-// L-BFGS (Nocedal 1980) with all that it needs of s and y as numbers, so that the vectors are read once before M and once
-// after it. Pairs stand in a ring, one place a trial; a pair without positive curvature stays out.
-struct Pairs {
+// L-BFGS (Nocedal 1980) in products of s and y, so that the vectors are read once before M and once after it. Pairs
+// form a ring buffer, one place a trial; a pair without positive curvature is not used.
+struct SecantPairs {
   double product[history][history] = {};  // s_i . y_j, j not older than i
   double inverse[history] = {};           // 1 / s_i . y_i
-  double pulled[history] = {};            // s_i . g
+  double s_dot_g[history] = {};           // s_i . g
   double alpha[history] = {};
-  bool valid[history] =
-      {};  // what a pair that is not has in the other arrays may be anything, NaN too
+  bool valid[history] = {};  // the other arrays of an invalid pair may hold anything, NaN too
 
   PD_HD void clear() {
     for (bool& v : valid) v = false;
   }
 
-  // The pair in place `newest`, by |s|^2 and |y|^2, once its products are there; `teaches`: it may count.
+  // Admits the pair at `newest`, whose products are stored, by |s|^2 and |y|^2; `teaches`: it may be used.
   PD_HD void admit(int newest, bool teaches, double ss, double yy) {
     const double curvature = product[newest][newest];
     inverse[newest] = 1 / curvature;
@@ -94,11 +96,11 @@ struct Pairs {
 
   PD_HD static int older(int place, int by) { return (place - by + history) % history; }
 
-  // g - sum alpha_i y_i is what M is applied to
+  // M is applied to g - sum alpha_i y_i
   PD_HD void first_loop(int newest) {
     for (int a = 0; a < history; ++a) {
       const int i = older(newest, a);
-      double rest = pulled[i];
+      double rest = s_dot_g[i];
       for (int b = 0; b < a; ++b) {
         const int j = older(newest, b);
         if (valid[j]) rest -= alpha[j] * product[i][j];
@@ -107,13 +109,13 @@ struct Pairs {
     }
   }
 
-  // g.d of the direction, `own` being that of z
+  // slope g.d of the direction; `own` is that of z
   PD_HD double slope(double own, const double (&c)[history]) const {
-    for (int i = 0; i < history; ++i) own += valid[i] ? c[i] * pulled[i] : 0;
+    for (int i = 0; i < history; ++i) own += valid[i] ? c[i] * s_dot_g[i] : 0;
     return own;
   }
 
-  // z + sum c_i s_i is the direction; `with` are y_i . z
+  // The direction is z + sum c_i s_i; `with` are y_i . z
   PD_HD void second_loop(int newest, const double (&with)[history], double (&c)[history]) const {
     for (int a = history - 1; a >= 0; --a) {
       const int i = older(newest, a);

@@ -1,4 +1,4 @@
-// How far the material of a step is from that which M of solver/multilevel/lbfgs.h was made of.
+// How far the material of a step is from the reference material of the preconditioner M (solver/multilevel/lbfgs.h).
 #pragma once
 #include "math/config.h"
 #include "views/views.h"
@@ -7,7 +7,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// Ratios of one to the other.
+// Range of the ratios of the step's values to the reference values.
 struct Range {
   double least = HUGE_VAL, largest = 0;
 
@@ -19,49 +19,49 @@ struct Range {
   }
 };
 
-constexpr double known_inertia =
-    4;  // times what M was made of and the elements have become: more is left to the diagonal
+constexpr double outlier_ratio =
+    4;  // times the reference and the elements' change: vertices beyond are outliers
 
-struct Misfit {
-  double scale = 1;        // s of A <= s A_0, strangers aside
-  double spread = 0;       // 1 - q / s, q A_0 <= A <= s A_0 with them
-  double trusted = 1;      // ratio of inertias up to known_inertia times which M is believed
-  bool strangers = false;  // whether there are vertices beyond, or that M alone holds
+struct MaterialMismatch {
+  double scale = 1;           // s of A <= s A_0, without outliers
+  double spread = 0;          // 1 - q / s for q A_0 <= A <= s A_0, with outliers
+  double trusted = 1;         // ratio of inertias that M can represent, within outlier_ratio
+  bool has_outliers = false;  // some vertices are outliers, or held by M alone
 
-  Misfit() = default;
+  MaterialMismatch() = default;
 
-  PD_HD Misfit(const Range& elements, const Range& inertias)
+  PD_HD MaterialMismatch(const Range& elements, const Range& inertias)
       : trusted(larger(elements.largest, smaller(inertias.least, inertias.largest))),
-        strangers(inertias.largest > known_inertia * trusted) {}
+        has_outliers(inertias.largest > outlier_ratio * trusted) {}
 
-  // `common`: the inertias that are no strangers'; `other_pins`: the step holds other vertices than M does
+  // `common`: ratios of all vertices but outliers; `other_pins`: the step holds other vertices than M does
   PD_HD void conclude(const Range& elements, const Range& inertias, const Range& common,
                       bool other_pins) {
     scale = larger(elements.largest, common.largest);
     const double least = smaller(elements.least, common.least);
     spread = other_pins ? 1 : 1 - least / larger(elements.largest, inertias.largest);
-    strangers = strangers || other_pins;
+    has_outliers = has_outliers || other_pins;
   }
 
   PD_HD static double larger(double a, double b) { return a < b ? b : a; }
   PD_HD static double smaller(double a, double b) { return b < a ? b : a; }
 };
 
-constexpr int ranges_count = 2;  // that threads compare at a time
+constexpr int ranges_count = 2;  // ranges that threads reduce at a time
 
-// Measures together with all threads of a team. The runner supplies each_tet(visit(t)) and each_vertex(visit(i, a)) over the
-// thread's share, a being 0 where the step holds the vertex, and meet(ranges), which makes them those of all threads.
+// Measures with all threads of a team. The runner supplies each_tet(visit(t)) and each_vertex(visit(i, a)) over the
+// thread's share, with a = 0 where the step holds the vertex. Its reduce(ranges) combines the ranges of all threads.
 #if defined(__CUDACC__)
 #pragma nv_exec_check_disable
 #endif
 template <class Runner, class T>
-PD_HD Misfit measure_misfit(Runner& run, const Levels<T>& levels, const T* stiffness) {
+PD_HD MaterialMismatch measure_mismatch(Runner& run, const Levels<T>& levels, const T* stiffness) {
   Range first[ranges_count], second[ranges_count];
   Range &elements = first[0], &inertias = first[1], &common = second[0], &differ = second[1];
   run.each_tet([&](std::int64_t t) {
     elements.count(double(stiffness[t]) / double(levels.reference_stiffness[t]));
   });
-  // visit(a / a_0) of the vertices that neither the step nor M holds; counts those that one of them alone holds
+  // visit(a / a_0) for vertices that neither the step nor M holds; counts those that only one of them holds
   const auto each_inertia = [&](const auto& visit) {
     run.each_vertex([&](std::int64_t i, double a) {
       const bool free = levels.fine_inverse[i] > T(0);
@@ -70,15 +70,15 @@ PD_HD Misfit measure_misfit(Runner& run, const Levels<T>& levels, const T* stiff
     });
   };
   each_inertia([&](double ratio) { inertias.count(ratio); });
-  run.meet(first);
-  Misfit misfit(elements, inertias);
-  const double most = known_inertia * misfit.trusted;
+  run.reduce(first);
+  MaterialMismatch mismatch(elements, inertias);
+  const double most = outlier_ratio * mismatch.trusted;
   each_inertia([&](double ratio) {
     if (!(ratio > most)) common.count(ratio);
   });
-  run.meet(second);
-  misfit.conclude(elements, inertias, common, differ.largest > 0);
-  return misfit;
+  run.reduce(second);
+  mismatch.conclude(elements, inertias, common, differ.largest > 0);
+  return mismatch;
 }
 
 }  // namespace pd::inline PD_TARGET

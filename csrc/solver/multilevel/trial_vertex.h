@@ -1,4 +1,5 @@
-// One vertex in an iteration of solver/multilevel/lbfgs.h: what M acts on, and the next trial. Runners supply loops and sums.
+// One vertex in an iteration of solver/multilevel/lbfgs.h: the restriction of fields for M, and the next trial. Runners
+// supply loops and sums.
 #pragma once
 #include "solver/multilevel/material_mismatch.h"
 #include "solver/vertex.h"
@@ -6,24 +7,25 @@
 
 namespace pd::inline PD_TARGET {
 
-// The preconditioner M does not model outliers: vertices that it holds, and those of much larger inertia than its own (Misfit).
+// Vertices that the preconditioner M does not model: those that it holds, and those with much larger inertia than its
+// reference (MaterialMismatch).
 template <class R>
 struct Outliers {
-  bool some;  // false: no vertex is one
-  R trusted;  // Misfit::trusted
+  bool some;  // whether there are any
+  R trusted;  // MaterialMismatch::trusted
 };
 
-template <class Lanes, bool Touching>
+template <class Lanes, bool HasContacts>
 struct TrialVertex {
   using T = typename Lanes::Scalar;
   using Value = typename Lanes::Value;
   using Real = typename Lanes::Real;
 
-  const Vertex<Lanes, Touching>& vertex;
-  Value iterate, residual;  // from which the next trial starts, and the residual there
-  const Mat3<Real>* free;   // Leeway::free of the iterate; not read without contacts
+  const Vertex<Lanes, HasContacts>& vertex;
+  Value iterate, residual;  // of the last accepted trial
+  const Mat3<Real>* free;   // ContactProjector::free at the iterate; not read without contacts
   const Levels<T>& levels;
-  std::int64_t number;  // of the vertex in the levels
+  std::int64_t number;  // vertex number in the levels
   const Outliers<Real>& outliers;
 
   // The part of `field` on which M acts: along the free directions, zero at an outlier.
@@ -33,10 +35,10 @@ struct TrialVertex {
     return along_free(at_outlier(Lanes::value({none, none, none}), field), along);
   }
 
-  // `direction` from M along the free directions; the residual times 1 / D across them and at an outlier.
+  // `direction` from M along the free directions; Jacobi's step, residual / D, across them and at an outlier.
   PD_HD Value completed(const Value& direction) const {
     const Value diagonal = vertex.inverse * residual;
-    if constexpr (!Touching) return at_outlier(diagonal, direction);
+    if constexpr (!HasContacts) return at_outlier(diagonal, direction);
     return at_outlier(diagonal,
                       along_free(direction, free) + (diagonal - along_free(diagonal, free)));
   }
@@ -45,10 +47,10 @@ struct TrialVertex {
   PD_HD Value step(const Contacts<Real>& contacts, const Value& before, const Value& gradient,
                    const Value& direction, const Real& length, const Real& beta) const {
     const Value displacement = completed(length * direction - beta * (iterate - before));
-    return vertex.land(contacts, iterate - displacement, iterate, gradient);
+    return vertex.project_trial(contacts, iterate - displacement, iterate, gradient);
   }
 
-  // Next trial of the fallback: a Jacobi iteration, where `accelerates` relaxed by theta and accelerated by omega.
+  // Next trial of the fallback: a Jacobi iteration; if `accelerates`, relaxed by theta and accelerated by omega.
   template <class Condition>
   PD_HD Value jacobi(const Contacts<Real>& contacts, const Value& before, const Value& gradient,
                      const Condition& accelerates, const Real& theta, const Real& omega) const {
@@ -62,14 +64,14 @@ struct TrialVertex {
 
  private:
   PD_HD static Value along_free(const Value& field, const Mat3<Real>* along) {
-    if constexpr (!Touching) return field;
+    if constexpr (!HasContacts) return field;
     return Lanes::value(*along * Lanes::vec3(field));
   }
 
   PD_HD Value at_outlier(const Value& there, const Value& elsewhere) const {
     if (!outliers.some) return elsewhere;
     if (!(levels.fine_inverse[number] > T(0))) return there;
-    const Real most = Real(T(known_inertia) * levels.reference_inertia[number]) * outliers.trusted;
+    const Real most = Real(T(outlier_ratio) * levels.reference_inertia[number]) * outliers.trusted;
     return select(vertex.inertia > most, there, elsewhere);
   }
 };

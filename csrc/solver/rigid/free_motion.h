@@ -22,8 +22,8 @@ namespace pd::inline PD_TARGET {
 // Sums over the vertices of a piece, in double. First those that give the mean of y; then the others, about that mean, so that far
 // from the origin, or where a stiff spring outweighs all other vertices, nothing cancels.
 struct RigidSums {
-  static constexpr int weight = 0, position = 1, lag = 4, spread = 7, turn = 13;
-  static constexpr int pins = 22, pin_position = 23, pin_spread = 26, count = 32;
+  static constexpr int weight = 0, position = 1, target_offset = 4, second_moment = 7, turn = 13;
+  static constexpr int pins = 22, pin_position = 23, pin_second_moment = 26, count = 32;
 };
 
 // Adds a vertex of weight a at y to the sums from `weight` on, over a and a y.
@@ -35,14 +35,15 @@ PD_HD void add_mean(W* sum, const W& a, const Vec3<W>& y) {
   sum[3] = multiply_add(a, y.z, sum[3]);
 }
 
-// Adds a vertex at `arm` from the mean, from which its target is `lag` away, to the sums from `lag` on, over a (z - y); a arm arm^T;
-// a (z - y) arm^T.
+// Adds a vertex to the sums from `target_offset` on: a (z - y); a r r^T; a (z - y) r^T. Here r = `lever_arm` is its
+// position from the mean, and z - y = `target_offset` leads to its target.
 template <class W>
-PD_HD void add_moments(W* sum, const W& a, const Vec3<W>& arm, const Vec3<W>& lag) {
-  constexpr int spread = RigidSums::spread - RigidSums::lag,
-                turn = RigidSums::turn - RigidSums::lag;
-  const W at[3] = {arm.x, arm.y, arm.z}, way[3] = {a * lag.x, a * lag.y, a * lag.z};
-  int n = spread;
+PD_HD void add_moments(W* sum, const W& a, const Vec3<W>& lever_arm, const Vec3<W>& target_offset) {
+  constexpr int second_moment = RigidSums::second_moment - RigidSums::target_offset,
+                turn = RigidSums::turn - RigidSums::target_offset;
+  const W at[3] = {lever_arm.x, lever_arm.y, lever_arm.z},
+          way[3] = {a * target_offset.x, a * target_offset.y, a * target_offset.z};
+  int n = second_moment;
   for (int r = 0; r < 3; ++r) {
     const W moment = a * at[r];
     sum[r] = sum[r] + way[r];
@@ -52,12 +53,13 @@ PD_HD void add_moments(W* sum, const W& a, const Vec3<W>& arm, const Vec3<W>& la
   }
 }
 
-// Adds a vertex that a pin holds on its target, where a is 0, to the sums from `pins` on, over 1; arm; arm arm^T.
+// Adds a vertex that a pin holds on its target (a = 0) to the sums from `pins` on: 1; r; r r^T, with r = `lever_arm`.
 template <class W>
-PD_HD void add_pin(W* sum, const W& a, const Vec3<W>& arm) {
-  const W at[3] = {arm.x, arm.y, arm.z}, pinned = select(a > W(0.0), W(0.0), W(1.0));
+PD_HD void add_pin(W* sum, const W& a, const Vec3<W>& lever_arm) {
+  const W at[3] = {lever_arm.x, lever_arm.y, lever_arm.z},
+          pinned = select(a > W(0.0), W(0.0), W(1.0));
   sum[0] = sum[0] + pinned;
-  int n = RigidSums::pin_spread - RigidSums::pins;
+  int n = RigidSums::pin_second_moment - RigidSums::pins;
   for (int r = 0; r < 3; ++r) {
     const W held = pinned * at[r];
     sum[1 + r] = sum[1 + r] + held;
@@ -157,13 +159,14 @@ struct RigidFit {
       : weight(sum[RigidSums::weight]), center(center_of(sum)) {
     using S = RigidSums;
     const double share = weight > 0 ? 1.0 / weight : 0.0;
-    shift = {share * sum[S::lag], share * sum[S::lag + 1], share * sum[S::lag + 2]};
-    const Mat3<double> spread = symmetric(sum + S::spread);
+    shift = {share * sum[S::target_offset], share * sum[S::target_offset + 1],
+             share * sum[S::target_offset + 2]};
+    const Mat3<double> second_moment = symmetric(sum + S::second_moment);
     const double* turn = sum + S::turn;
     for (int r = 0; r < 3; ++r)
       covariance.row[r] =
-          spread.row[r] + Vec3<double>{turn[3 * r], turn[3 * r + 1], turn[3 * r + 2]};
-    square = share * (spread.row[0].x + spread.row[1].y + spread.row[2].z);
+          second_moment.row[r] + Vec3<double>{turn[3 * r], turn[3 * r + 1], turn[3 * r + 2]};
+    square = share * (second_moment.row[0].x + second_moment.row[1].y + second_moment.row[2].z);
     if (sum[S::pins] > 0) turn_about_pins(sum, pins_apart * pins_apart * square);
   }
 
@@ -182,11 +185,12 @@ struct RigidFit {
     using S = RigidSums;
     const double share = 1.0 / sum[S::pins];
     const double* at = sum + S::pin_position;
-    const double middle[3] = {share * at[0], share * at[1], share * at[2]};
-    const Vec3<double> pivot = {middle[0], middle[1], middle[2]};  // from the mean
-    Mat3<double> spread = share * symmetric(sum + S::pin_spread);
-    for (int r = 0; r < 3; ++r) spread.row[r] = subtract_product(spread.row[r], middle[r], pivot);
-    const SignedSvd<double> svd = signed_svd(spread);
+    const double centroid[3] = {share * at[0], share * at[1], share * at[2]};
+    const Vec3<double> pivot = {centroid[0], centroid[1], centroid[2]};  // from the mean
+    Mat3<double> second_moment = share * symmetric(sum + S::pin_second_moment);
+    for (int r = 0; r < 3; ++r)
+      second_moment.row[r] = subtract_product(second_moment.row[r], centroid[r], pivot);
+    const SignedSvd<double> svd = signed_svd(second_moment);
     hold = svd.s[1] > apart ? Hold::all : svd.s[0] > apart ? Hold::line : Hold::point;
     axis = {svd.u.row[0].x, svd.u.row[1].x, svd.u.row[2].x};
     const Vec3<double> reach = sum[S::weight] * (shift - pivot);
@@ -205,7 +209,8 @@ struct RigidFit {
 struct Touch {
   static constexpr int planes = 8;
   static constexpr unsigned others = 1u << planes;
-  static constexpr int slip = 0, rubbing = 3, lying = 4, arm = 5, spread = 8, sums = 14;
+  static constexpr int slip = 0, rubbing = 3, lying = 4, lever_arm = 5, second_moment = 8,
+                       sums = 14;
   static constexpr int share = 6, bounds = 7;
 };
 
@@ -227,8 +232,9 @@ PD_HD void add_start(W (&sum)[StartSums::count], const Contacts<R>& contacts, co
     return Vec3<W>{convert<double>(a.x), convert<double>(a.y), convert<double>(a.z)};
   };
   const R none(0), one(1);
-  const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
-  const R apart = select(contacts.least_gap(x + target, told) > none, none, one);
+  const int distinct_planes =
+      contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
+  const R apart = select(contacts.least_gap(x + target, distinct_planes) > none, none, one);
   const R beside = select(inverse > none, apart, one);
   const W a = convert<double>(inertia);
   const W stiffness = W(1.0) / convert<double>(select(inverse > none, inverse, one)) - a;
@@ -271,18 +277,20 @@ PD_HD bool starts_still(const double (&sum)[StartSums::count]) {
 }
 
 // Adds a vertex at y = x + u, whose piece would move by `motion`, to these; `near(k, gap)` learns how far from the first planes it
-// would come, and at last from the other contacts. `settled`: after the iterations. Then balls, which curve away from a piece that they
-// hold, count by left_by, in numbers of 0 and less that are no distances.
+// would come, and at last from the other contacts. `settled`: after the iterations. Then spheres, which curve away from a piece that they
+// hold, count by remaining_gap, in numbers of 0 and less that are no distances.
 template <class W, class R, class Near>
 PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
                      const Contacts<R>& contacts, const Vec3<R>& y, const Vec3<R>& u,
                      const RigidMotion<R>& motion, bool settled, const Near& near) {
   const R none(0), one(1), far(HUGE_VAL);
-  const Vec3<R> way = motion.of(y), moved = y + way, arm = y - motion.center;
+  const Vec3<R> way = motion.of(y), moved = y + way, lever_arm = y - motion.center;
   // in double, since their spread is a difference
-  const Vec3<W> wide_arm = {convert<double>(arm.x), convert<double>(arm.y), convert<double>(arm.z)};
-  const int told = contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
-  for (int k = 0; k < told; ++k) {
+  const Vec3<W> wide_lever_arm = {convert<double>(lever_arm.x), convert<double>(lever_arm.y),
+                                  convert<double>(lever_arm.z)};
+  const int distinct_planes =
+      contacts.plane_count < Touch::planes ? contacts.plane_count : Touch::planes;
+  for (int k = 0; k < distinct_planes; ++k) {
     const Plane<R>& plane = contacts.planes[k];
     const R before = gap(plane, y), after = gap(plane, moved);
     near(k, after);
@@ -291,12 +299,12 @@ PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
     bounds[Touch::share] =
         lesser(bounds[Touch::share],
                convert<double>(select(after > none, far, select(comes, share, none))));
-    const R reach = -R(scalar_of<R>(lies_within)) * dot(motion.shift, plane.normal);
+    const R reach = -R(scalar_of<R>(contact_tolerance)) * dot(motion.shift, plane.normal);
     const R lies = select(before < reach, one, none);
     const R rubs = select(plane.friction > none, lies, none);
     const Vec3<R> slip = rubs * tangential(u, plane.normal);
     const W there = convert<double>(lies);
-    const Vec3<W> at = there * wide_arm;
+    const Vec3<W> at = there * wide_lever_arm;
     const W add[Touch::sums] = {convert<double>(slip.x),
                                 convert<double>(slip.y),
                                 convert<double>(slip.z),
@@ -305,12 +313,12 @@ PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
                                 at.x,
                                 at.y,
                                 at.z,
-                                at.x * wide_arm.x,
-                                at.x * wide_arm.y,
-                                at.x * wide_arm.z,
-                                at.y * wide_arm.y,
-                                at.y * wide_arm.z,
-                                at.z * wide_arm.z};
+                                at.x * wide_lever_arm.x,
+                                at.x * wide_lever_arm.y,
+                                at.x * wide_lever_arm.z,
+                                at.y * wide_lever_arm.y,
+                                at.y * wide_lever_arm.z,
+                                at.z * wide_lever_arm.z};
     for (int n = 0; n < Touch::sums; ++n) sums[n] = sums[n] + add[n];
     const R slips[3] = {slip.x, slip.y, slip.z};
     for (int n = 0; n < 3; ++n) {
@@ -320,7 +328,7 @@ PD_HD void add_touch(W (&sums)[Touch::sums], W (&bounds)[Touch::bounds],
       bounds[3 + n] = lesser(bounds[3 + n], convert<double>(most));
     }
   }
-  near(Touch::planes, contacts.least_left(y, way, told, settled));
+  near(Touch::planes, contacts.least_remaining_gap(y, way, distinct_planes, settled));
 }
 
 // Of the contacts that a piece does not touch: `touches(k)` says which of the first planes it does.
@@ -328,9 +336,9 @@ template <class R, class Touches>
 PD_HD R least_gap_beside(const Contacts<R>& contacts, const Vec3<R>& y, const Vec3<R>& way,
                          bool settled, const Touches& touches) {
   constexpr int most = Touch::planes;
-  const int told = contacts.plane_count < most ? contacts.plane_count : most;
-  R least = contacts.least_left(y, way, told, settled);
-  for (int k = 0; k < told; ++k)
+  const int distinct_planes = contacts.plane_count < most ? contacts.plane_count : most;
+  R least = contacts.least_remaining_gap(y, way, distinct_planes, settled);
+  for (int k = 0; k < distinct_planes; ++k)
     least = lesser(least, select(touches(k), R(HUGE_VAL), gap(contacts.planes[k], y + way)));
   return least;
 }
@@ -386,7 +394,7 @@ constexpr int motion_legs = 4;
 
 // Whether a motion ends at the first of the planes, since the piece is above all that it would touch.
 PD_HD bool comes_to_plane(unsigned touched, const double (&bounds)[Touch::bounds]) {
-  return touched != 0 && touched < Touch::others && bounds[Touch::share] > lies_within;
+  return touched != 0 && touched < Touch::others && bounds[Touch::share] > contact_tolerance;
 }
 
 // The motion that contacts leave to a piece that touches some of them; `plane(k)` are the first of them. From above all of these it

@@ -80,7 +80,7 @@ struct TippingSearch {
       // as a difference, so that what stays where it is keeps its distance to the last bit
       meet(distance, distance + dot(n, way), subtract_product(distance, down, dot(n, normal)));
     }
-    if (contacts.ball_count > 0) {
+    if (contacts.sphere_count > 0) {
       const R distance = contacts.least_gap(y, contacts.plane_count);
       meet(distance, contacts.least_gap(y + way, contacts.plane_count), distance);
     }
@@ -146,29 +146,30 @@ struct Tipping {
     end();
     first = first_of_step;
     const Vec3<double> n = plane.normal;
-    reach = -lies_within * dot(fit.shift, n);
+    reach = -contact_tolerance * dot(fit.shift, n);
     if (fit.hold != Hold::none || !(reach > 0.0) || !(sums[Touch::lying] > 0.0)) return;
     number = plane_number;
     count = round = 0;
     share = 1.0;
     const double each = 1.0 / sums[Touch::lying];
-    const double* at = sums + Touch::arm;
-    const Vec3<double> middle = {each * at[0], each * at[1], each * at[2]};
+    const double* at = sums + Touch::lever_arm;
+    const Vec3<double> centroid = {each * at[0], each * at[1], each * at[2]};
     // at rest: torque about the middle is that about the mean, and that of the force there
     const Vec3<double> force = -fit.weight * fit.shift;
-    const Vec3<double> torque = -axis_of(fit.covariance) - cross(middle, force);
+    const Vec3<double> torque = -axis_of(fit.covariance) - cross(centroid, force);
     away = (1.0 / dot(force, n)) * cross(n, torque);
-    pressure = fit.center + middle + away;
+    pressure = fit.center + centroid + away;
     stage = Stage::seek;
-    const Mat3<double> spread =
-        less_outer(each * symmetric(sums + Touch::spread), 1.0, middle, middle);
+    const Mat3<double> second_moment =
+        less_outer(each * symmetric(sums + Touch::second_moment), 1.0, centroid, centroid);
     const double least = pins_apart * pins_apart * fit.square;
-    const Mat3<double> minors = cofactor(spread);
-    const double across = trace(minors), size = trace(spread);
+    const Mat3<double> minors = cofactor(second_moment);
+    const double across = trace(minors), size = trace(second_moment);
     near = pressure_near * square_root(size > 0.0 ? size : 0.0);
     // on a point or a line nothing rests
     if (across <= least * (size + least)) return;
-    if (!(dot(away, solve(less_identity(spread, -least), away)) > resting)) stage = Stage::none;
+    if (!(dot(away, solve(less_identity(second_moment, -least), away)) > resting))
+      stage = Stage::none;
   }
 
   PD_HD TippingSearch<double> search(const Plane<double>& plane) const {
@@ -373,8 +374,9 @@ struct Tipping {
     const Vec3<double> left =
         subtract_product(force, push, subtract_product(n, plane.friction, way));
     const double twist = dot(n, axis_of(fit.covariance) + cross(pressure - fit.center, force));
-    const Vec3<double> arm = on[count - 1].at - on[0].at;
-    return dot(left, left) <= doubt * doubt && twist * twist <= doubt * doubt * dot(arm, arm) &&
+    const Vec3<double> lever_arm = on[count - 1].at - on[0].at;
+    return dot(left, left) <= doubt * doubt &&
+           twist * twist <= doubt * doubt * dot(lever_arm, lever_arm) &&
            dot(beside, beside) <= near * near;
   }
 
@@ -392,12 +394,13 @@ struct Tipping {
                       const Vec3<double>& slip) const {
     const Vec3<double> n = plane.normal;
     const Vec3<double> back = subtract_product(-slip, drop(plane), n);
-    const Vec3<double> arm = on[0].at - fit.center, goal = arm + back;
-    const Mat3<double> covariance = less_outer(fit.covariance, fit.weight, fit.shift - goal, arm);
+    const Vec3<double> lever_arm = on[0].at - fit.center, goal = lever_arm + back;
+    const Mat3<double> covariance =
+        less_outer(fit.covariance, fit.weight, fit.shift - goal, lever_arm);
     Mat3<double> turn = {};
     if (rolls) turn = count < 2 ? best_turn(covariance) : best_turn_about(covariance, line());
     const Mat3<double> part = part_of_turn(turn, share);
-    const double push = fit.weight * dot(n, back - part * arm - fit.shift);
+    const double push = fit.weight * dot(n, back - part * lever_arm - fit.shift);
     const Vec3<double> torque = -axis_of(turned_covariance(covariance, turn));
     const bool holds = push > 0.0 && between(n, torque, push);
     return {{part, on[0].at, back}, push > 0.0, holds};
@@ -413,16 +416,16 @@ struct Tipping {
   // line and the force.
   PD_COLD Trial sliding(const RigidFit& fit, const Plane<double>& plane,
                         const Vec3<double>& way) const {
-    const Vec3<double> n = plane.normal, arm = on[0].at - fit.center;
+    const Vec3<double> n = plane.normal, lever_arm = on[0].at - fit.center;
     const Vec3<double> along = subtract_product(n, plane.friction, way);  // of the force
     Mat3<double> turn = {};
     bool found = false, done = false;
     PD_ROLLED
     for (int step = 0; step < balance_steps && !done; ++step) {
       done = found;  // the step after the last one takes what that leaves
-      const Vec3<double> at = arm + turn * arm;
+      const Vec3<double> at = lever_arm + turn * lever_arm;
       const Mat3<double> product = turned_covariance(fit.covariance, turn);
-      const double push = fit.weight * lift_of(fit, plane, turn * arm);
+      const double push = fit.weight * lift_of(fit, plane, turn * lever_arm);
       const Vec3<double> torque = axis_of(product) + push * cross(at, along);
       const Mat3<double> stiffness =
           less_identity(-1.0 * transpose(product), -trace(product) - push * dot(at, along));
@@ -447,20 +450,21 @@ struct Tipping {
       }
       found = dot(size, size) < balanced * balanced;
     }
-    const double lift = lift_of(fit, plane, turn * arm), push = fit.weight * lift;
+    const double lift = lift_of(fit, plane, turn * lever_arm), push = fit.weight * lift;
     const Vec3<double> shift = multiply_add(lift, along, fit.shift);
-    const Vec3<double> at = arm + turn * arm;
+    const Vec3<double> at = lever_arm + turn * lever_arm;
     const Vec3<double> torque =
         -axis_of(turned_covariance(fit.covariance, turn)) - push * cross(at, along);
     bool holds = found && push > 0.0 && between(n, torque, push);
     if (plane.friction > 0.0) {
-      const Vec3<double> after = tangential(on[0].slip + turn * arm + shift, n);
+      const Vec3<double> after = tangential(on[0].slip + turn * lever_arm + shift, n);
       holds = holds && dot(after, way) > slips_onward * square_root(dot(after, after));
     }
     const Mat3<double> part = part_of_slide(turn, n);
-    return {{part, fit.center, multiply_add(lift_of(fit, plane, part * arm), along, fit.shift)},
-            push > 0.0,
-            holds};
+    return {
+        {part, fit.center, multiply_add(lift_of(fit, plane, part * lever_arm), along, fit.shift)},
+        push > 0.0,
+        holds};
   }
 
   // A share of how it rolls and of how it turns about the normal, so that the line of two vertices stays level.
