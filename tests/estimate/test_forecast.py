@@ -200,7 +200,7 @@ def test_a_default_that_is_far_too_small_is_said_once_and_printed() -> None:
     (warning,) = compiled(iterations=None)
     assert warning.category is UnsolvedWarning
     assert warning.filename == __file__
-    assert "the default of 64 iterations leaves an error of about 0.3" in str(warning.message)
+    assert "the default of 64 iterations leaves a relative error of about 0.3" in str(warning.message)
     # who names a number has decided; 64 of Multilevel are plenty; a tolerance does not make 64 more
     for options in ({}, {"tolerance": 1e-4}, {"iterations": None, "solver": pd.Multilevel()}):
         assert compiled(**options) == []
