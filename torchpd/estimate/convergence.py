@@ -12,9 +12,9 @@ estimate. Meshes with slivers, and steps that are a rigid motion, needed the lea
 needed 0.2 to 1.25 times.
 
 With smooth planes the estimate of `Multilevel` is for the impact of a stiff body on a face (`benchmarks/landings.py`).
-It is two square roots of the count of Chebyshev, and at least a seventh of that count with slivers or strongly varying
-stiffness; most steps need far fewer. With friction or spheres, and with schedules that do not treat rigid rotations, it
-is an upper bound: the count of Chebyshev. `Simulator.tune` measures instead.
+It is two square roots of the count of Chebyshev. With slivers or strongly varying stiffness it is at least a seventh of
+that count. Most steps need far fewer. With friction or spheres, and with schedules that do not treat rigid rotations,
+it is an upper bound: the count of Chebyshev. `Simulator.tune` measures instead.
 """
 
 from __future__ import annotations

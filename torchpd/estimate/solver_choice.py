@@ -51,8 +51,8 @@ MARGIN = 1.8  # factor on the estimate: enough for 19 of 20 random scenes, and f
 PATIENCE = 4  # further factor where a tolerance ends easy steps early: hard steps, which no estimate covers, need it
 # most iterations, times `PATIENCE` with a tolerance: float32 resolves no more, and a step must end
 MOST_OF_CHEBYSHEV = 10_000
-# factor on the time of a Multilevel iteration with contacts: resting boxes of 125 to 9,261 vertices took 1.1 to 1.7
-# times as long as swinging ones on an H100, 1.1 to 1.4 times on the CPU
+# Factor on the time of a Multilevel iteration with contacts. Resting boxes of 125 to 9,261 vertices, compared with
+# swinging ones, took 1.1 to 1.7 times as long on an H100, 1.1 to 1.4 times on the CPU.
 ON_CONTACTS = 1.4
 MAKING = 3  # least iterations of "lbfgs" that "corotated" must save
 

@@ -1,8 +1,9 @@
 """Split cells of any kind into tets and triangles that fill them exactly and match across shared faces.
 
-A quad face is cut from its vertex of the lowest number, so that both of its sides are cut alike (Dompierre, Labbé,
-Vallet and Camarero 1999, "How to subdivide pyramids, prisms and hexahedra into tetrahedra"). A cell is then the cone
-from one of its corners over the faces without that corner.
+A quad face is cut from its vertex of the lowest number, so that both of its sides are cut alike. A cell is then the
+cone from one of its corners over the faces without that corner.
+
+Source: Dompierre, Labbé, Vallet and Camarero, "How to subdivide pyramids, prisms and hexahedra into tetrahedra", 1999.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Every tet joins the centres of two neighbouring cubes to one edge of the square 
 with dihedral angles of 60 and 90 degrees (a cube cut into six has 45), and have no preferred diagonal.
 
 Lengths here are in cubes: cube (i, j, k) fills [i, i + 1] x [j, j + 1] x [k, k + 1]. Corner positions are integers in
-half cubes: even for cube corners, odd for cube centres. A tet is (axis, i, j, k, edge): it lies across the square
+half cubes: even for cube corners, odd for cube centres. A tet is (axis, i, j, k, edge). It lies across the square
 between cube (i, j, k) and the next cube along `axis`, over the edge number `edge` of that square.
 """
 
@@ -284,8 +284,11 @@ class Lattice:
         """Tets and barycentric coordinates of points in cubes.
 
         Let q be the position from the centre of the point's cube, and |q_a| >= |q_b| >= |q_c|. The tet lies across the
-        square on the side of q_a, over the edge on the side of q_b. Its weights are 1 - |q_a| - |q_b| at that centre,
-        |q_a| - |q_b| at the next one, and |q_b| -+ q_c at the ends of the edge along c: none is negative.
+        square on the side of q_a, over the edge on the side of q_b. None of its weights is negative:
+
+            1 - |q_a| - |q_b|   at that centre
+            |q_a| - |q_b|       at the next centre
+            |q_b| -+ q_c        at the ends of the edge along c
         """
         cube = np.floor(place).astype(np.int64)
         q = place - cube - 0.5

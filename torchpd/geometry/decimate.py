@@ -161,7 +161,7 @@ def simplify(mesh: TriMesh, triangles: int) -> TriMesh:
     if left > most:
         raise ValueError(
             f"simplify: {most} triangles must be enough for the topology and shape of the surface, reached {left} "
-            f"of {len(mesh.triangles)}; ask for more, or make a coarse mesh by other means"
+            f"of {len(mesh.triangles)}; ask for more, or supply a coarse mesh"
         )
     used, numbers = np.unique(surface.triangles[surface.alive], return_inverse=True)
     return TriMesh(surface.vertices[used], numbers.reshape(-1, 3))

@@ -31,8 +31,8 @@ Mask = NDArray[np.bool_]
 # Face k lies opposite corner k; seen from outside its corners run counter-clockwise when the tet has positive volume.
 TET_FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
-# Vertices nearer than this fraction of the bounding box diagonal coincide: a few roundings of float32, which many files
-# hold, in a box about as far from the origin as it is wide.
+# Vertices nearer than this fraction of the bounding box diagonal coincide. It is a few roundings of float32, which many
+# files hold, in a box about as far from the origin as it is wide.
 ROUNDING = 4.0 * float(np.finfo(np.float32).eps)
 # No grid has this direction: different points project to different places.
 _DIRECTION = np.array([0.8128, 0.4953, 0.3065])
@@ -161,8 +161,8 @@ def report_faces(points: Array, tets: Index) -> None:
     faces = sort_faces(tets)
     if faces.crowded:
         warn(
-            f"TetMesh: {faces.crowded} of the faces belong to three tets or more, and some of these tets overlap; "
-            "remove the tets that are no part of the body"
+            f"TetMesh: {faces.crowded} of the faces belong to three tets or more, so some tets overlap; remove "
+            "those that are no part of the body"
         )
     if faces.folded:
         _report_folded(points, tets, faces)

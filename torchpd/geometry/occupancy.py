@@ -67,9 +67,9 @@ class _Edges(NamedTuple):
 def parts_of(surface: TriMesh, tolerance: float, *, fill_holes: bool) -> Parts:
     """Split a surface into parts, and close holes by a cone over each connected piece of open edges.
 
-    Parts that are already closed stay exact. In the others, vertices at open edges closer than `tolerance` are merged,
-    since files repeat vertices along seams, not always to the bit; strips of triangles close the seams. Pieces with
-    mostly open edges after that are sheets. Triangles that come from both sides count once.
+    Parts that are already closed stay exact. In the others, vertices at open edges closer than `tolerance` are merged:
+    files repeat vertices along seams, not always to the bit. Strips of triangles close the seams. Pieces with mostly
+    open edges after that are sheets. Triangles that come from both sides count once.
     """
     same = number_rows(surface.vertices)
     triangles = surface.triangles[_without_duplicates(surface.triangles, same)]
@@ -126,7 +126,7 @@ def _without_duplicates(triangles: Index, same: Index) -> Mask:
 def _merge_open_edges(vertices: Array, same: Index, edges: _Edges, tolerance: float) -> tuple[Array, Index]:
     """Position and number of every vertex; merged vertices have equal ones.
 
-    Ends of open edges are merged if they are closer than `tolerance`, and than half of all edges there: the neighbours
+    Ends of open edges are merged if they are closer than `tolerance`, and than half of all edges there. So neighbours
     along a fine rim stay apart.
     """
     shortest = np.full(len(vertices), np.inf)
@@ -304,8 +304,8 @@ def _slabs(lattice: Lattice, found: list[_Intervals]) -> Iterator[tuple[slice, N
     """Layers of cubes, and the fraction of the small cube around each sample [x, y, z] inside any part.
 
     Each axis estimates it: the covered length of its grid line. A majority of axes decides between inside (more than
-    half) and outside, and the least certain of that majority gives the value: the line steepest to a nearby face. A
-    single axis may look through a crack. One half counts as both, since a face may lie in a plane of samples.
+    half) and outside. The least certain of that majority gives the value: the line steepest to a nearby face. A single
+    axis may look through a crack. One half counts as both, since a face may lie in a plane of samples.
     """
     samples = np.array(lattice.shape) * _SAMPLES
     thick = max(1, int(_SLAB // (_SAMPLES * samples[1] * samples[2])))

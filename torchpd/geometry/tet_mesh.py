@@ -238,8 +238,9 @@ def without_face_checks(
 def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
     """Embed a surface in a tetrahedral mesh: each vertex in the tet that contains it, or else in the nearest one.
 
-    A vertex outside of the mesh is extrapolated, with negative weights. A `MeshWarning` gives the largest distance of a
-    vertex farther outside than its tet is long: a strain of that tet moves it by more than the strain.
+    A vertex outside of the mesh is extrapolated, with negative weights. A strain of the tet
+    moves a distant vertex by more than the strain. A `MeshWarning` reports vertices farther outside than their tet is
+    long.
     """
     for name, value, kind in (("surface", surface, TriMesh), ("mesh", mesh, TetMesh)):
         if not isinstance(value, kind):

@@ -60,8 +60,8 @@ def tetrahedralize(
 
     `mesh.fill` is the fraction of each tet inside the surface. `Solid` multiplies density and Young's modulus by it. So
     a body has the mass of the enclosed volume (to 2 % and less; 3 % if it is about one cell thick) and about its
-    stiffness. Fractions are at least 0.05, for the solvers, and the stiffness of a tet is at least a tenth. The tets
-    that a sheet passes are full. For full tets everywhere, leave the fractions out: `TetMesh(mesh.vertices,
+    stiffness. Fractions are at least 0.05, for the solvers, and the stiffness of a tet is at least a tenth of full.
+    The tets that a sheet passes are full. For full tets everywhere, leave the fractions out: `TetMesh(mesh.vertices,
     mesh.tets).with_embedding(mesh.embedding)`.
 
     "tetwild" follows the surface closely with tets of varying shape; it needs the package pytetwild.

@@ -13,7 +13,7 @@ favours a grid, with fewer and larger patches the more environments run at a tim
 fits.
 
 A cluster assigns every vertex to one patch. A patch holds every tetrahedron that touches one of its own vertices, so
-tetrahedra at patch borders are computed more than once. Patches exchange no forces: once an iteration the new position
+tetrahedra at patch borders are computed more than once. Patches exchange no forces. Once an iteration the new position
 of a vertex is written to the shared memory of the patches that hold a copy. The patches of the other kernels share no
 tetrahedra and exchange the forces on shared vertices.
 
@@ -47,8 +47,8 @@ _CLUSTER_TETS, _CLUSTER_EACH = 8000, 75
 _CLUSTER_OWN = 0.7
 # multilevel solver: environments are many if each has at most this number of multiprocessors
 _MANY_SHARE = 4
-# multilevel solver: least tetrahedra per patch; largest mesh in one block, in general and for few environments;
-# tetrahedra per patch for many environments, which run faster with fewer patches
+# Multilevel solver: least tetrahedra per patch; largest mesh in one block, in general and for few environments; and
+# tetrahedra per patch for many environments. These run faster with fewer patches.
 _MIN_LEVEL_TETS, _MAX_BLOCK_TETS, _MAX_BLOCK_TETS_FEW, _MANY_TETS = 384, 1152, 384, 1900
 _LEVELS = ("few", "any", "many")  # by the number of environments
 # Most tetrahedra per patch, five rounds of its threads when all are paired; and patches per multiprocessor of an H100
@@ -310,9 +310,9 @@ def choose_plan(
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
         gpu: properties of the device.
-        kernel: a name, "benchmark" (`fastest` chooses), or "auto": the fastest by `kernel_costs` if the batch is
-            known, else the first of "block", "cluster", "grid", "stream" that fits. "auto" uses a cluster only for a
-            small mesh.
+        kernel: a name, "benchmark" (`fastest` chooses) or "auto". "auto" takes the fastest by `kernel_costs` for a
+            known batch, else the first of "block", "cluster", "grid", "stream" that fits. It uses a cluster only for
+            a small mesh.
         levels: for a multilevel solver, which runs as "stream" except for its iterations.
         batch: number of environments of a step; None: unknown, treated as between few and many.
         progress: show a bar when the mesh is large.
