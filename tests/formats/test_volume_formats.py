@@ -166,7 +166,7 @@ def test_meshes_of_fluent_share_the_suffix_of_gmsh(tmp_path: Path, binary: bool)
     expect_mixed(content_of(path), regions=False)
     data = path.read_bytes()
     path.write_bytes(data.replace(b"(12 (0 1 8 0))", b"(12 (0 1 9 0))"))
-    with pytest.raises(ValueError, match=r"a\.msh \(Gmsh\): it is a mesh of Fluent that declares 9 cells, got 8"):
+    with pytest.raises(ValueError, match=r"a\.msh \(Gmsh\): .*Fluent .*9 cells, .*8"):
         TetMesh.from_file(path)
     path.write_bytes(data + b"(13 (2 1 1 2 3)(\n1 2 3 1 0\n))\n")
     with pytest.raises(ValueError, match="a mesh of Fluent, which lists faces"):
@@ -303,7 +303,7 @@ def test_regions_of_vtk(tmp_path: Path) -> None:
     assert regions is not None
     assert regions.tolist() == [7, 8]
     path.write_text(VTK_TETS + "CELL_DATA 2\n" + scalars.format("b") + "FIELD f 1\na 1 2 int\n1 2\n")
-    with pytest.warns(MeshWarning, match=r"several cell arrays hold integers \(a, b\)"):
+    with pytest.warns(MeshWarning, match=r"a\.vtk: .*integers \(a, b\)"):
         assert tets_in(path).regions is None
 
 
@@ -376,7 +376,7 @@ def test_medit(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"a\.mesh \(Medit\): Tetrahedra should be 1 rows of 5 numbers, got 5 more"):
         TetMesh.from_file(tmp_path / "a.mesh")
     (tmp_path / "a.mesh").write_text(text.partition("Ridges")[0])
-    with pytest.warns(MeshWarning, match="End is missing: was the file cut off"):
+    with pytest.warns(MeshWarning, match=r"no End"):
         tets_in(tmp_path / "a.mesh")
     (tmp_path / "b.mesh").write_text("MFEM mesh v1.0\n")
     with pytest.raises(ValueError, match=r"b\.mesh .*MeshVersionFormatted, got 'MFEM'"):

@@ -45,7 +45,7 @@ def read(path: Path) -> MeshContent:
     points, cells, ended = _read_binary(path.read_bytes()) if binary else _read_text(path)
     if points is None:
         raise ValueError("it has no Vertices")
-    return MeshContent(as_3d(points), cells, notes=[] if ended else ["End is missing: was the file cut off?"])
+    return MeshContent(as_3d(points), cells, notes=[] if ended else ["no End: was the file cut off?"])
 
 
 def _read_text(path: Path) -> tuple[Array | None, list[Cells], bool]:
