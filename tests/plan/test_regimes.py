@@ -316,7 +316,9 @@ def test_registers_of_clusters_are_those_of_the_table(source: str, dtype: torch.
     used = [
         int(row["registers"])
         for row in rows
-        if row["source"] == f"cuda-fused_{source}.cu" and row["architecture"] == "90" and "Blocks)1," in row["kernel"]
+        if row["source"] == f"cuda-fused-fused_{source}.cu"
+        and row["architecture"] == "90"
+        and "Blocks)1," in row["kernel"]
     ]
     assert -(-max(used) // 8) * 8 == kernel_costs._CLUSTER_REGISTERS[dtype]
 
@@ -329,7 +331,7 @@ def test_shared_vertices_have_room_beside_the_pipeline(architecture: str) -> Non
     used = {
         row["kernel"]: -(-int(row["registers"]) // 8) * 8
         for row in rows
-        if row["source"] == "cuda-stream_float.cu" and row["architecture"] == architecture
+        if row["source"] == "cuda-stream-stream_float.cu" and row["architecture"] == architecture
     }
     pipelines = [registers for kernel, registers in used.items() if "stream_pipeline" in kernel]
     beside = [registers for kernel, registers in used.items() if "stream_shared" in kernel and "float, false" in kernel]
