@@ -114,7 +114,7 @@ def test_gmsh_beside_the_mesh(tmp_path: Path) -> None:
     assert regions is not None
     assert regions.tolist() == [1, 2]
     (tmp_path / "c.msh").write_text(gmsh("3\n1 4 2 5 1 1 2 3 4\n2 4 2 6 2 2 3 4 5\n3 4 2 7 2 2 3 4 5\n"))
-    with pytest.warns(MeshWarning, match="1 elements come again"):
+    with pytest.warns(MeshWarning, match="1 repeated elements"):
         regions = tets_in(tmp_path / "c.msh").regions
     assert regions is not None
     assert regions.tolist() == [5, 6]
@@ -137,9 +137,9 @@ def test_gmsh_with_partitions(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("elements", "words"),
     [
-        ("3\n1 4 2 7 1 1 2 3 4\n2 4 2 7 2 2 3 4 5\n", "declares 3 elements, but 2 come"),
+        ("3\n1 4 2 7 1 1 2 3 4\n2 4 2 7 2 2 3 4 5\n", "declares 3 elements, got 2"),
         ("1\n1 4 2 7 1 1 2 3 4\n2 4 2 7 2 2 3 4 5\n", "1 elements should have 9 numbers"),
-        ("1\n1 4 2 7 1 1 2 3 6\n", "name node 6, which does not come"),
+        ("1\n1 4 2 7 1 1 2 3 6\n", "name node 6, which is missing"),
         ("1\n1 777 2 7 1 1 2 3 6\n", "type 777"),
         ("1000000000000000\n1 4 2 7 1 1 2 3 4\n", "1000000000000000 elements"),
     ],
@@ -155,7 +155,7 @@ def test_gmsh_4_counts_are_compared(tmp_path: Path) -> None:
     for wrong in (nodes.replace("1 4 1 4", "1 5 1 4"), nodes):
         text = f"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n{wrong}$Elements\n1 2 1 2\n3 1 4 1\n1 1 2 3 4\n$EndElements\n"
         (tmp_path / "a.msh").write_text(text)
-        with pytest.raises(ValueError, match=r"a\.msh \(Gmsh\): it declares (5 nodes, but 4|2 elements, but 1) come"):
+        with pytest.raises(ValueError, match=r"a\.msh \(Gmsh\): it declares (5 nodes, got 4|2 elements, got 1)"):
             TetMesh.from_file(tmp_path / "a.msh")
 
 
@@ -166,7 +166,7 @@ def test_meshes_of_fluent_share_the_suffix_of_gmsh(tmp_path: Path, binary: bool)
     expect_mixed(content_of(path), regions=False)
     data = path.read_bytes()
     path.write_bytes(data.replace(b"(12 (0 1 8 0))", b"(12 (0 1 9 0))"))
-    with pytest.raises(ValueError, match=r"a\.msh \(Gmsh\): it is a mesh of Fluent that declares 9 cells, but 8 come"):
+    with pytest.raises(ValueError, match=r"a\.msh \(Gmsh\): .*Fluent .*9 cells, .*8"):
         TetMesh.from_file(path)
     path.write_bytes(data + b"(13 (2 1 1 2 3)(\n1 2 3 1 0\n))\n")
     with pytest.raises(ValueError, match="a mesh of Fluent, which lists faces"):
@@ -303,7 +303,11 @@ def test_regions_of_vtk(tmp_path: Path) -> None:
     assert regions is not None
     assert regions.tolist() == [7, 8]
     path.write_text(VTK_TETS + "CELL_DATA 2\n" + scalars.format("b") + "FIELD f 1\na 1 2 int\n1 2\n")
+<<<<<<< HEAD
     with pytest.warns(MeshWarning, match=r"several cell arrays hold integers \(a, b\)"):
+=======
+    with pytest.warns(MeshWarning, match=r"a\.vtk: .*integers \(a, b\)"):
+>>>>>>> wpy2
         assert tets_in(path).regions is None
 
 
@@ -373,12 +377,10 @@ def test_medit(tmp_path: Path) -> None:
     assert regions is not None
     assert regions.tolist() == [7, 8]
     (tmp_path / "a.mesh").write_text(text.replace("Tetrahedra\n2", "Tetrahedra\n1"))
-    with pytest.raises(
-        ValueError, match=r"a\.mesh \(Medit\): Tetrahedra should be 1 rows of 5 numbers, but 5 more come"
-    ):
+    with pytest.raises(ValueError, match=r"a\.mesh \(Medit\): Tetrahedra should be 1 rows of 5 numbers, got 5 more"):
         TetMesh.from_file(tmp_path / "a.mesh")
     (tmp_path / "a.mesh").write_text(text.partition("Ridges")[0])
-    with pytest.warns(MeshWarning, match="no End comes: was the file cut off"):
+    with pytest.warns(MeshWarning, match=r"no End"):
         tets_in(tmp_path / "a.mesh")
     (tmp_path / "b.mesh").write_text("MFEM mesh v1.0\n")
     with pytest.raises(ValueError, match=r"b\.mesh .*MeshVersionFormatted, got 'MFEM'"):

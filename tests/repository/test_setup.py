@@ -74,7 +74,11 @@ def test_an_extension_without_the_shared_runtime_is_refused() -> None:
     assert library_names(DYNAMIC_SECTION % "libstdc++.so.6") == ["libc10.so", "libstdc++.so.6"]
     assert runtime_fault(["libc10.so", "libstdc++.so.6"], "c++") == ""
     fault = runtime_fault(library_names(DYNAMIC_SECTION % "libc.so.6"), "c++ -static-libstdc++")
-    for said in ("`c++ -static-libstdc++` links libstdc++ statically", "needs libc10.so, libc.so.6", "LDFLAGS"):
+    for said in (
+        "`c++ -static-libstdc++` must link libstdc++ as a shared library",
+        "got libc10.so, libc.so.6",
+        "LDFLAGS",
+    ):
         assert said in fault
 
 

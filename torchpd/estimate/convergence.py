@@ -50,7 +50,7 @@ _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/solver/chebyshev.h
 _LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
 # Multilevel at an impact: factors on the Chebyshev count for an error of 1e-3, and on its square root
 _LANDING_SHARE, LANDING_ROOTS = 1.0 / 7.0, 2.0
-# limits of an even body: smallest dihedral angle, and largest ratio of stiffness between tetrahedra; `tetrahedralize`
+# limits of an even body: smallest dihedral angle, and largest ratio of stiffness between tetrahedra. `tetrahedralize`
 # leaves a ratio of up to ten where tets are partly filled
 _EVEN_ANGLE, _EVEN_STIFFNESS = math.radians(5.0), 30.0
 _MOST = 10_000

@@ -27,7 +27,7 @@ def check_room(count: int, least: int, room: int, what: str) -> None:
 def check_rows(lines: list[str], count: int, what: str) -> None:
     """Refuse a file with more or fewer lines than the rows that it declares."""
     if len(lines) != count:
-        raise ValueError(f"it declares {count} {what}, a line each, but {len(lines)} lines come")
+        raise ValueError(f"it declares {count} {what}, a line each, got {len(lines)} lines")
 
 
 def text_of(path: Path) -> str:
@@ -122,7 +122,7 @@ class Text:
         begin, found, chunk = self.at, 0, 32 * count + 64
         while found < count:
             if self.at >= len(self.data):
-                raise ValueError(f"it ends among {what}: {count} numbers should come, {found} do")
+                raise ValueError(f"it ends among {what}: expected {count} numbers, got {found}")
             end = self.at + min(chunk, _CHUNK)
             # a chunk ends with a word
             while end < len(self.data) and self.data[end - 1] not in _SPACE:

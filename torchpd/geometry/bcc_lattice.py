@@ -132,7 +132,7 @@ def candidates(low: Array, high: Array, shape: tuple[int, ...]) -> tuple[Index, 
 def _neighbours(ids: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Tets on both sides of every inner face, from the tet numbers [axis, i, j, k, edge].
 
-    A tet meets two others over the same square, and one in each of its two cubes: around a cube edge, the squares of
+    A tet meets two others over the same square, and one in each of its two cubes. Around a cube edge, the squares of
     two axes meet. The outermost layer of cubes is excluded.
     """
     first, second = [], []

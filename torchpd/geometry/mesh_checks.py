@@ -133,7 +133,7 @@ def determinants(points: Array, tets: Index) -> Array:
 def is_flat(points: Array, tets: Index, values: Array) -> NDArray[np.bool_]:
     """Mask of tets whose volume is within the float64 rounding of a flat tet.
 
-    In a bounding box that reaches to M from the origin, a coordinate is off by up to u M, a vertex by sqrt(3) u M. Each
+    Let the bounding box reach to M from the origin. A coordinate is off by up to u M, a vertex by sqrt(3) u M. Each
     vertex changes the determinant by twice the opposite area. The four areas add up to at most sqrt(3) l^2 (l the
     longest edge), so the bound is 6 u M l^2. The evaluation adds less than 10 u l^3 (8 roundings of at most 1.16 l^3,
     the permanent).

@@ -42,10 +42,12 @@ class TetMesh:
     """A tetrahedral mesh. Every tet has positive volume: det(x1 - x0, x2 - x0, x3 - x0) > 0.
 
     Tets with the opposite winding are turned: their last two corners change places. A `MeshWarning` reports them, and
-    `flipped` counts them. Other warnings report tets that hardly any body has:
+    `flipped` counts them. Other warnings report unusual contacts of tets:
 
-    - inner faces with both tets on one side (a folded mesh), - faces of three or more tets, - coincident faces without
-    common vertices, see `merged`, - coincident faces with other corners.
+    - Inner faces have both tets on one side (a folded mesh).
+    - A face belongs to three or more tets.
+    - Faces coincide without common vertices, see `merged`.
+    - Faces coincide with faces of other corners.
 
     Separate components are no fault; `quality()` counts them. Arrays are NumPy's and read-only.
     `torch.tensor(mesh.vertices)` copies one without a warning, where `torch.from_numpy` warns.

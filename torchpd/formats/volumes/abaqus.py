@@ -53,7 +53,7 @@ def read(path: Path) -> MeshContent:
         elif name == "INSTANCE":
             key = options.get("PART", "").upper()
             if key not in parts:
-                raise ValueError(f"*INSTANCE names part {options.get('PART', '')!r}, which does not come before it")
+                raise ValueError(f"*INSTANCE names part {options.get('PART', '')!r}, which is not defined before it")
             places.append(Place.of(options.get("NAME", ""), parts[key], keyword.lines))
             part, joins = places[-1].part, False
         elif joins:

@@ -124,7 +124,7 @@ def read_elements(part: Part, lines: list[str], options: dict[str, str]) -> None
     else:
         values = _whole(" ".join(lines), f"elements of type {name}")
         if len(values) % (count + 1):
-            raise ValueError(f"elements of type {name} must have {count} nodes, but {len(values)} numbers come")
+            raise ValueError(f"elements of type {name} must have {count} nodes, got {len(values)} numbers")
         rows = list(values.reshape(-1, count + 1))
     if not rows:
         return

@@ -41,7 +41,7 @@ def read(path: Path) -> MeshContent:
         check_rows(lines[1 + count :], total, "cells")
     table = parse("\n".join(lines[1 : 1 + count]).encode(), np.float64, "points")
     if len(table) != 4 * count:
-        raise ValueError(f"its {count} points must have number, x, y and z, but {len(table)} numbers come")
+        raise ValueError(f"its {count} points must have number, x, y and z, got {len(table)} numbers")
     rows = table.reshape(count, 4)
     place = Numbering(rows[:, 0].astype(np.int64), "point")
     kinds, nodes, regions = list[str](), list[list[int]](), list[int]()

@@ -46,7 +46,7 @@ def _table(
     entries = [entry for part in groups for entry in part]
     declared = sum(int(part.get("size", "-1")) for part in groups)
     if declared != len(entries) or any(entry.tag != tag for entry in entries):
-        raise ValueError(f"it declares {declared} entries <{tag}>, but {len(entries)} come in <{group}>")
+        raise ValueError(f"it declares {declared} entries <{tag}>, got {len(entries)} in <{group}>")
     order = [int(entry.get("index", "-1")) for entry in entries]
     if sorted(order) != list(range(len(entries))):
         raise ValueError(f"indices of <{tag}> must be 0 to {len(entries) - 1}, each once")

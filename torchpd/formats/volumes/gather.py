@@ -80,5 +80,5 @@ class Numbering:
         missing = self.numbers[inside] != used if len(self.numbers) else np.ones(used.shape, dtype=bool)
         if missing.any():
             lost = used[missing]
-            raise ValueError(f"cells name {self.what} {int(lost[0])}, which does not come ({len(lost)} such in all)")
+            raise ValueError(f"cells name {self.what} {int(lost[0])}, which is missing ({len(lost)} such in all)")
         return np.asarray(self.order[inside], dtype=np.int64)

@@ -194,7 +194,7 @@ def _first(numbers: Numbers, count: int, what: str) -> Index:
 
 def _compare(came: int, declared: int, what: str) -> None:
     if came != declared:
-        raise ValueError(f"it declares {declared} {what}, but {came} come")
+        raise ValueError(f"it declares {declared} {what}, got {came}")
 
 
 def _read_elements(file: _File, numbers: Numbers, name: str) -> None:
@@ -262,7 +262,7 @@ def _read_rows(file: _File, text: Numbers) -> None:
     starts, kinds, tags = list[int](), list[int](), list[int]()
     for _ in range(total):
         if at + 3 > len(plain):
-            raise ValueError(f"it declares {total} elements, but {len(starts)} come")
+            raise ValueError(f"it declares {total} elements, got {len(starts)}")
         kind, count = plain[at + 1], 2 if old else plain[at + 2]
         if count < 0:
             raise ValueError(f"an element must have at least 0 tags, got {count}")
@@ -271,7 +271,7 @@ def _read_rows(file: _File, text: Numbers) -> None:
         tags.append(count)
         at += (5 if old else 3 + count) + _nodes_of(kind)
     if at != len(plain):
-        raise ValueError(f"its {total} elements should have {at} numbers, but {len(plain)} come")
+        raise ValueError(f"its {total} elements should have {at} numbers, got {len(plain)}")
     begin = np.array(starts, dtype=np.int64)
     form = np.column_stack([np.array(kinds, dtype=np.int64), np.array(tags, dtype=np.int64)]).reshape(-1, 2)
     for kind, count in np.unique(form, axis=0).tolist():
@@ -302,9 +302,9 @@ def _content(file: _File) -> MeshContent:
             solid.append(cells[-1])
     notes = list(file.notes)
     if len(file.present) < file.partitions:
-        notes.append(f"only {len(file.present)} of its {file.partitions} partitions come")
+        notes.append(f"only {len(file.present)} of its {file.partitions} partitions are there")
     if repeated:
-        notes.append(f"{repeated} elements come again, for other physical groups, and were left out")
+        notes.append(f"{repeated} repeated elements, for other physical groups, were left out")
     # without physical groups, the volumes of the geometry are the regions if there are several
     grouped = any(physical.any() for _, _, physical, _ in (solid or cells))
     entities = np.unique(np.concatenate([entity for *_, entity in solid] or [np.zeros(1, np.int64)]))

@@ -45,7 +45,7 @@ def read(path: Path) -> MeshContent:
     points, cells, ended = _read_binary(path.read_bytes()) if binary else _read_text(path)
     if points is None:
         raise ValueError("it has no Vertices")
-    return MeshContent(as_3d(points), cells, notes=[] if ended else ["no End comes: was the file cut off?"])
+    return MeshContent(as_3d(points), cells, notes=[] if ended else ["no End: was the file cut off?"])
 
 
 def _read_text(path: Path) -> tuple[Array | None, list[Cells], bool]:
@@ -78,7 +78,7 @@ def _rows(numbers: Text, width: int, key: str) -> Array:
     count = int(numbers.ints(1, key)[0])
     rows = numbers.floats(width * count, key).reshape(count, width)
     if more := numbers.left():
-        raise ValueError(f"{key} should be {count} rows of {width} numbers, but {more} more come")
+        raise ValueError(f"{key} should be {count} rows of {width} numbers, got {more} more")
     return rows
 
 

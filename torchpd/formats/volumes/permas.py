@@ -76,5 +76,5 @@ def _table(rows: list[str], width: int, what: str) -> np.ndarray[tuple[int, int]
     """Rows of `width` numbers, which & joins across lines."""
     values = parse(" ".join(rows).replace("&", " ").encode(), np.float64, what)
     if len(values) % width:
-        raise ValueError(f"{what} must have {width} numbers each, but {len(values)} come")
+        raise ValueError(f"{what} must have {width} numbers each, got {len(values)}")
     return np.asarray(values.reshape(-1, width))

@@ -62,7 +62,7 @@ def read(path: Path) -> MeshContent:
                 nodes.append(numbers[1 : 1 + corners])
             at += count
     if markers != declared:
-        raise ValueError(f"it declares {declared} markers, but {markers} come")
+        raise ValueError(f"it declares {declared} markers, got {markers}")
     if points is None:
         raise ValueError("it has no NPOIN")
     return MeshContent(as_3d(points), blocks_of(kinds, nodes))

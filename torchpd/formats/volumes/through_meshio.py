@@ -57,7 +57,7 @@ def _read_fluent(path: Path) -> MeshContent:
     came = sum(map(len, content.cells))
     if head is None or int(head.group(1), 16) != came:
         listed = "no number of cells" if head is None else f"{int(head.group(1), 16)} cells"
-        raise ValueError(f"it is a mesh of Fluent that declares {listed}, but {came} come")
+        raise ValueError(f"it is a mesh of Fluent that declares {listed}, got {came}")
     return content
 
 

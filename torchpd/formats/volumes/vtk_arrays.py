@@ -117,7 +117,7 @@ class Document:
             expected = last if number == count - 1 and last else full
             part = _unpack(self.compressor, data[at : at + length], expected)
             if len(part) != expected:
-                raise ValueError(f"a block of array {name} should have {expected} bytes, but {len(part)} come")
+                raise ValueError(f"a block of array {name} should have {expected} bytes, got {len(part)}")
             parts.append(part)
             at += length
         return b"".join(parts)

@@ -99,7 +99,7 @@ def _points(document: Document, element: Element) -> Array:
     if not points.size:
         points = points.reshape(0, 3)
     if points.shape != (declared, 3):
-        raise ValueError(f"a piece declares {declared} points of 3 coordinates, but {list(points.shape)} come")
+        raise ValueError(f"a piece declares {declared} points of 3 coordinates, got {list(points.shape)}")
     return points
 
 
@@ -114,12 +114,12 @@ def _cells(
         raise ValueError(f"<{section.tag}> has no array {missing[0]!r}")
     nodes, ends = (_whole(document.array(arrays[name]), name) for name in ("connectivity", "offsets"))
     if len(ends) != count:
-        raise ValueError(f"a piece declares {count} cells in <{section.tag}>, but {len(ends)} come")
+        raise ValueError(f"a piece declares {count} cells in <{section.tag}>, got {len(ends)}")
     sizes = np.diff(offsets_of(ends, nodes, section.tag))
     if kinds is None:
         types = _whole(document.array(arrays["types"]), "types")
         if len(types) != count:
-            raise ValueError(f"a piece declares {count} cells, but {len(types)} types come")
+            raise ValueError(f"a piece declares {count} cells, got {len(types)} types")
         return types, nodes, sizes
     types = np.full(count, kinds[0])
     for size, kind in kinds[1].items():
