@@ -32,27 +32,31 @@ SOLVERS: dict[str, Solver] = {"Chebyshev": pd.Chebyshev(), "Multilevel": pd.Mult
 H = 1 / 60
 
 
-class Subject(NamedTuple):
+class ContactScene(NamedTuple):
     """A body of `shape` times as many cells, its contact, its initial motion and number of steps."""
 
     shape: tuple[int, int, int]
     size: tuple[float, float, float]
-    on_ball: bool
+    on_sphere: bool
     velocity: tuple[float, float, float]
     steps: int
 
 
-SUBJECTS = {
-    "cube lands": Subject((3, 3, 3), (0.4, 0.4, 0.4), False, (0.0, -1.0, 0.0), 0),
-    "cube slides": Subject((3, 3, 3), (0.4, 0.4, 0.4), False, (1.0, -1.0, 0.3), 6),
-    "slab slides": Subject((6, 1, 6), (0.8, 0.13, 0.8), False, (1.0, -1.0, 0.3), 6),
-    "cube on ball": Subject((3, 3, 3), (0.4, 0.4, 0.4), True, (0.5, -1.0, 0.0), 3),
+CONTACT_SCENES = {
+    "cube lands": ContactScene((3, 3, 3), (0.4, 0.4, 0.4), False, (0.0, -1.0, 0.0), 0),
+    "cube slides": ContactScene((3, 3, 3), (0.4, 0.4, 0.4), False, (1.0, -1.0, 0.3), 6),
+    "slab slides": ContactScene((6, 1, 6), (0.8, 0.13, 0.8), False, (1.0, -1.0, 0.3), 6),
+    "cube on ball": ContactScene((3, 3, 3), (0.4, 0.4, 0.4), True, (0.5, -1.0, 0.0), 3),
 }
 
 
-def made(subject: Subject, cells: int, youngs: float, friction: float, dtype: torch.dtype, device: str) -> pd.Simulator:
-    mesh = pd.shapes.box(subject.size, tuple(cells * n for n in subject.shape))
-    contact = pd.Sphere((0.2, -0.5, 0.2), 0.5, friction) if subject.on_ball else pd.Ground(0.0, friction=friction)
+def simulator_of(
+    contact_scene: ContactScene, cells: int, youngs: float, friction: float, dtype: torch.dtype, device: str
+) -> pd.Simulator:
+    mesh = pd.shapes.box(contact_scene.size, tuple(cells * n for n in contact_scene.shape))
+    contact = (
+        pd.Sphere((0.2, -0.5, 0.2), 0.5, friction) if contact_scene.on_sphere else pd.Ground(0.0, friction=friction)
+    )
     scene = pd.Scene(pd.Solid(mesh, youngs, 1000.0), pd.Gravity(), contact)
     sim = pd.Simulator(scene, H, 400, pd.Multilevel(), dtype=dtype, progress=False)
     return sim.to(device)
@@ -61,11 +65,11 @@ def made(subject: Subject, cells: int, youngs: float, friction: float, dtype: to
 @torch.no_grad()
 def compare(name: str, cells: int, youngs: float, friction: float, device: str, seconds: float) -> dict[str, Any]:
     """A row: iterations and milliseconds of each solver to each error, None if `COUNTS` are not enough."""
-    subject = SUBJECTS[name]
-    sim = made(subject, cells, youngs, friction, torch.float64, device)
+    contact_scene = CONTACT_SCENES[name]
+    sim = simulator_of(contact_scene, cells, youngs, friction, torch.float64, device)
     state = sim.rest_state()
-    state.velocities[:] = torch.tensor(subject.velocity)
-    for _ in range(subject.steps):
+    state.velocities[:] = torch.tensor(contact_scene.velocity)
+    for _ in range(contact_scene.steps):
         state = sim(state)
     residual = 1.0
     while residual > SOLVED and sim.iterations < 10_000:
@@ -75,7 +79,7 @@ def compare(name: str, cells: int, youngs: float, friction: float, device: str, 
     goal = float((state.positions + H * state.velocities - solution.positions).norm())
     row: dict[str, Any] = {"scene": name, "vertices": sim.vertices, "youngs": youngs, "friction": friction}
     row.update(residual=residual, solvers={})
-    timed = made(subject, cells, youngs, friction, torch.float32, device)
+    timed = simulator_of(contact_scene, cells, youngs, friction, torch.float32, device)
     start = pd.State(*(part.float() for part in state))
     for solver, value in SOLVERS.items():
         sim.solver = timed.solver = value
@@ -124,8 +128,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    ways = list(itertools.product(SUBJECTS, options.cells, STIFFNESSES, FRICTIONS))
-    rows = [compare(*way, options.device, options.seconds) for way in tqdm(ways, desc="contacts", unit="step")]
+    cases = list(itertools.product(CONTACT_SCENES, options.cells, STIFFNESSES, FRICTIONS))
+    rows = [compare(*case, options.device, options.seconds) for case in tqdm(cases, desc="contacts", unit="step")]
     print(table(rows))
     if options.out:
         run = describe_run(torch.device(options.device), options.threads)

@@ -45,8 +45,8 @@ from sanitize_plants import (  # noqa: F401  (some for tests)
 from sanitize_scenes import (
     BAR,
     DTYPES,
+    KERNEL_CASES,
     KERNELS,
-    WAYS,
     ball_of_patches,
     bar,
     compiled_for,
@@ -221,12 +221,12 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
     count = 0
     flags = list(enumerate(itertools.product((False, True), repeat=2)))
     options: dict[str, Any] = {"dtype": dtype, "kernel": known_as(kernel), "progress": False}
-    for way in WAYS[kernel]:
-        with compiled_for(kernel, way):
+    for case in KERNEL_CASES[kernel]:
+        with compiled_for(kernel, case):
             # contacts of held bodies only here: other meshes use the kernels of free bodies
-            for number, (contacts, pieces) in flags if way is WAYS[kernel][0] else flags[:2] + flags[3:]:
+            for number, (contacts, pieces) in flags if case is KERNEL_CASES[kernel][0] else flags[:2] + flags[3:]:
                 solver, tolerance = SOLVERS[number % len(SOLVERS)], 1e-2 if number % 2 else 0.0
-                built = scene(way.mesh, contacts=contacts, pieces=pieces, pins=True)
+                built = scene(case.mesh, contacts=contacts, pieces=pieces, pins=True)
                 sim = pd.Simulator(built, 1 / 60, 5, solver=solver, tolerance=tolerance, **options).to("cuda")
                 step_all_ways(sim, 3)
                 count += 1
@@ -244,12 +244,12 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
     if kernel == "grid":
         # its vertices are in several parts in the adjoint's solve
         fields(pd.Simulator(pd.Scene(pd.Solid(bar(11, 9, 9), 1e5)), 1 / 60, **options).to("cuda"), 2)
-    with compiled_for(kernel, WAYS[kernel][0]):
-        free = scene(WAYS[kernel][0].mesh, contacts=True, pieces=True, pins=False)
+    with compiled_for(kernel, KERNEL_CASES[kernel][0]):
+        free = scene(KERNEL_CASES[kernel][0].mesh, contacts=True, pieces=True, pins=False)
         step_all_ways(pd.Simulator(free, 1 / 60, 5, **options).to("cuda"), 2)
     if kernel == "grid":
         built = scene(BAR, contacts=True, pieces=True, pins=True)
-        with compiled_for(kernel, WAYS[kernel][0]):
+        with compiled_for(kernel, KERNEL_CASES[kernel][0]):
             many = pd.Simulator(built, 1 / 60, 5, solver=SOLVERS[0], tolerance=1e-2, **options).to("cuda")
         many.plan = in_many_patches(many)
         step_all_ways(many, 3)
@@ -259,12 +259,12 @@ def every_way(kernel: str, dtype: torch.dtype) -> int:
 
 def large_patches(dtype: torch.dtype) -> int:
     """Run one step of each mesh."""
-    for way in WAYS["large"]:
-        with compiled_for("large", way) as name:
-            built = scene(way.mesh, contacts=False, pieces=False, pins=False)
+    for case in KERNEL_CASES["large"]:
+        with compiled_for("large", case) as name:
+            built = scene(case.mesh, contacts=False, pieces=False, pins=False)
             sim = pd.Simulator(built, 1 / 60, 5, dtype=dtype, kernel=name, progress=False).to("cuda")
         sim(sim.rest_state(2))
-    return len(WAYS["large"])
+    return len(KERNEL_CASES["large"])
 
 
 def several_environments(dtype: torch.dtype) -> int:
@@ -272,8 +272,10 @@ def several_environments(dtype: torch.dtype) -> int:
     if dtype == torch.float64:
         return 0
     count = 0
-    for way, (contacts, pieces) in itertools.product(WAYS["several"], ((False, False), (False, True), (True, True))):
-        built = scene(way.mesh, contacts=contacts, pieces=pieces, pins=True)
+    for case, (contacts, pieces) in itertools.product(
+        KERNEL_CASES["several"], ((False, False), (False, True), (True, True))
+    ):
+        built = scene(case.mesh, contacts=contacts, pieces=pieces, pins=True)
         for solver, tolerance in ((SOLVERS[0], 0.0), (SOLVERS[0], 1e-2), (SOLVERS[1 + count % 2], 0.0)):
             options: dict[str, Any] = {"solver": solver, "tolerance": tolerance, "progress": False}
             sim = pd.Simulator(built, 1 / 60, 5, kernel="block", **options).to("cuda")

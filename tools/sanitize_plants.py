@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from sanitize_scenes import BAR, WAYS, KernelCase, ball_of_patches, compiled_for, samples_everywhere, scene
+from sanitize_scenes import BAR, KERNEL_CASES, KernelCase, ball_of_patches, compiled_for, samples_everywhere, scene
 from torch import Tensor
 
 import torchpd as pd
@@ -60,13 +60,13 @@ def plant_in_patches(tool: str) -> None:
 
 def planted_scene(kernel: str) -> pd.Scene:
     """A scene large enough that a block has several warps, which can race."""
-    mesh = WAYS[kernel][0].mesh if kernel in ("block", "far", "large") else BAR
+    mesh = KERNEL_CASES[kernel][0].mesh if kernel in ("block", "far", "large") else BAR
     return scene(mesh, contacts=False, pieces=True, pins=False)
 
 
 def plant_in_step(tool: str, kernel: str) -> None:
     """Run a step in which `tool` must find an error."""
-    with compiled_for(kernel, KernelCase(BAR, {}) if kernel == "levels" else WAYS[kernel][0]) as name:
+    with compiled_for(kernel, KernelCase(BAR, {}) if kernel == "levels" else KERNEL_CASES[kernel][0]) as name:
         options: dict[str, Any] = {"solver": pd.Multilevel()} if kernel == "levels" else {"kernel": name}
         sim = pd.Simulator(planted_scene(kernel), 1 / 60, 5, progress=False, **options).to("cuda")
     state = sim.rest_state(2)

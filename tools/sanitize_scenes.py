@@ -48,7 +48,7 @@ SMALL, LARGE = dict.fromkeys(DTYPES, 24), {torch.float32: 2304, torch.float64: 9
 # The smallest scenes found for all instantiations. "far" is a grid whose patches have several tetrahedra and vertices
 # per thread. "large" is a stream of such patches, and of one with more slots than a pipeline counts. "several" is
 # "block" in float32 for meshes so small that many environments share blocks.
-WAYS = {
+KERNEL_CASES = {
     # of several small ones per block: each with few registers, two with two rounds, two with one
     "several": (KernelCase(bar(4, 2, 2), {}), KernelCase(BAR, {}), KernelCase(bar(2, 2, 2), {})),
     # all vertex arrays in shared memory; not all: in float32, in float64
@@ -68,7 +68,7 @@ WAYS = {
     ),
     "large": (KernelCase(bar(19, 20, 1), {"_STREAM_TETS": LARGE}), KernelCase(crumbs(129), {"_STREAM_TETS": LARGE})),
 }
-KERNELS = tuple(WAYS)
+KERNELS = tuple(KERNEL_CASES)
 
 
 def known_as(kernel: str) -> str:
@@ -77,9 +77,9 @@ def known_as(kernel: str) -> str:
 
 
 @contextmanager
-def compiled_for(kernel: str, way: KernelCase) -> Iterator[str]:
-    """The simulator's name of a kernel of KERNELS, while the patches are those of `way`."""
-    with mock.patch.dict(vars(regimes), way.constants):
+def compiled_for(kernel: str, case: KernelCase) -> Iterator[str]:
+    """The simulator's name of a kernel of KERNELS, while the patches are those of `case`."""
+    with mock.patch.dict(vars(regimes), case.constants):
         yield known_as(kernel)
 
 

@@ -33,9 +33,9 @@ def fixture_tool() -> dict[str, Any]:
 def plans_of(tool: dict[str, Any], kernel: str, dtype: torch.dtype, **flags: bool) -> list[Plan]:
     """For all of a kernel's meshes."""
     plans = []
-    for way in tool["WAYS"][kernel]:
-        values = tool["scene"](way.mesh, **flags).values()
-        with tool["compiled_for"](kernel, way) as name:
+    for case in tool["KERNEL_CASES"][kernel]:
+        values = tool["scene"](case.mesh, **flags).values()
+        with tool["compiled_for"](kernel, case) as name:
             plans.append(regimes.choose_plan(values, dtype, H100, name, progress=False))
     return plans
 
@@ -65,7 +65,7 @@ def test_every_way_is_planted_an_error_that_shows(tool: dict[str, Any]) -> None:
     """No array ends where another may begin."""
     for kernel in tool["KERNELS"]:
         values = tool["planted_scene"](kernel).values()
-        with tool["compiled_for"](kernel, tool["WAYS"][kernel][0]) as name:
+        with tool["compiled_for"](kernel, tool["KERNEL_CASES"][kernel][0]) as name:
             plan = regimes.choose_plan(values, torch.float32, H100, name, progress=False)
         assert len(tool["without_last"](plan.part_slot)) == len(plan.part_slot) - 1
     patches = tool["ball_of_patches"]()

@@ -179,7 +179,7 @@ def _starts(rows: Index, count: int) -> Index:
 
 
 def corner_lists(elements: Index, count: int) -> tuple[Index, Index]:
-    """For each of `count` vertices, the start of its list and the corners (width * element + corner) around it."""
+    """For each of `count` vertices: the start of its list, and the corners (width * element + corner) around it."""
     flat = elements.reshape(-1)
     return _starts(flat, count), np.argsort(flat, kind="stable")
 

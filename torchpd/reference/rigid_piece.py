@@ -178,7 +178,7 @@ def rotation_about(half: Array) -> Array:
 
 
 def fraction_of(turn: Array, share: float) -> Array:
-    """About the fraction `share` of a rotation: its Cayley vector times `share`; identity for a half turn (no axis)."""
+    """About `share` of a rotation: its Cayley vector times `share`; identity for a half turn (no axis)."""
     if share == 1.0:
         return turn
     left = 1.0 + float(np.trace(turn))

@@ -54,7 +54,7 @@ class UncertainWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Setting:
-    """What one task studies: the stiffness and resolution of a body, and a time step."""
+    """Parameters of one task: the stiffness and resolution of a body, and a time step."""
 
     youngs: float  # Pa
     time_step: float  # s
