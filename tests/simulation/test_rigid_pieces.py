@@ -360,5 +360,5 @@ def test_scenes_without_pieces_are_refused_with_the_numbers() -> None:
         with pytest.raises(ValueError, match=f"{counted}.*10000 to 500000 Pa.*stiffer_than"):
             pd.RigidPieces(sim, stiffer_than=threshold)
     solid = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2)), 1e5)
-    with pytest.raises(ValueError, match="RigidPieces: the scene must have no contacts"):
+    with pytest.raises(ValueError, match=r"RigidPieces: .*contacts"):
         pd.RigidPieces(pd.Simulator(pd.Scene(solid, pd.Ground()), iterations=8), stiffer_than=0.0)
