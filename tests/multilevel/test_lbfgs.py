@@ -1,4 +1,4 @@
-"""L-BFGS by inner products (`Pairs` of csrc/solver/multilevel/lbfgs.h): its direction is that of the dense update."""
+"""L-BFGS by inner products (`SecantPairs` of csrc/solver/multilevel/lbfgs.h): its direction is that of the dense update."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ int main() {{
   read(y[0], pairs * size);
   read(g, size);
   read(m, size);
-  pd::Pairs ring;
+  pd::SecantPairs ring;
   for (int n = 0; n < pairs; ++n) {{
     for (int i = n < pd::history ? 0 : n - pd::history + 1; i <= n; ++i)
       ring.product[i % pd::history][n % pd::history] = dot(s[i], y[n]);
@@ -39,7 +39,7 @@ int main() {{
   }}
   const int newest = (pairs - 1) % pd::history;
   const auto number = [&](int place) {{ return pairs - 1 - (newest - place + pd::history) % pd::history; }};
-  for (int i = 0; i < pd::history; ++i) ring.pulled[i] = dot(s[number(i)], g);
+  for (int i = 0; i < pd::history; ++i) ring.s_dot_g[i] = dot(s[number(i)], g);
   ring.first_loop(newest);
   double d[size];
   for (int k = 0; k < size; ++k) {{
