@@ -1,4 +1,4 @@
-"""L-BFGS by inner products (`SecantPairs` of csrc/solver/multilevel/lbfgs.h): its direction is that of the dense update."""
+"""L-BFGS by inner products (`SecantPairs` of csrc/solver/multilevel/lbfgs.h): the direction of the dense update."""
 
 from __future__ import annotations
 
