@@ -96,7 +96,7 @@ def test_without_a_converged_step_there_is_no_result(
     sim = bar(solver=pd.Multilevel(), iterations=9)
     unsure = [dataclasses.replace(step, uncertainty=14.0) for step in exact_steps(sim, swinging(sim))]
     monkeypatch.setattr(tuning, "exact_steps", lambda *_, **__: unsure * 7)
-    with pytest.raises(RuntimeError, match=r"no converged step to compare with: .* wrong by 1\.4e\+01"):
+    with pytest.raises(RuntimeError, match=r"converged .*1\.4e\+01"):
         sim.tune(swinging(sim), **request_)  # type: ignore[arg-type]
     assert (sim.solver, sim.iterations, sim.tuning_result) == (pd.Multilevel(), 9, None)
 
@@ -248,9 +248,7 @@ def test_what_friction_leaves_out_is_said() -> None:
     sim = pd.Simulator(scene, 1 / 30, progress=False, iterations=16)
     state = sim.rest_state()
     state.velocities[..., 1] = -2.0
-    with pytest.warns(
-        TuningWarning, match=r"\(error 0.001 not reached; Multilevel, not tried because of friction, might"
-    ):
+    with pytest.warns(TuningWarning, match=r"\(error 0\.001 .*Multilevel, .*friction"):
         sim.tune(state, error=1e-3, most=8)
     with pytest.warns(TuningWarning, match="cannot be reached"):
         sim.tune(state, error=1e-3, most=1, candidates=[pd.Chebyshev(), pd.Multilevel()])

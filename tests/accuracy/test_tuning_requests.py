@@ -19,7 +19,7 @@ def test_candidates_may_be_given() -> None:
         assert sim.tune(swinging(sim), error=0.3, candidates=[pd.Jacobi()]).solver == pd.Jacobi()
     with pytest.raises(ValueError, match=r"candidates .*got none"):
         sim.tune(error=0.1, candidates=[])
-    with pytest.raises(TypeError, match=r"candidates must be solvers, .* got 'auto'"):
+    with pytest.raises(TypeError, match=r"candidates .*got 'auto'"):
         sim.tune(error=0.1, candidates=["auto"])  # type: ignore[list-item]
     with pytest.raises(ValueError, match=r"velocities .*got \[3, 63, 3\]"):
         sim.tune(pd.State(sim.rest_state(2).positions, sim.rest_state(3).velocities), error=0.1)
@@ -49,7 +49,7 @@ def test_bad_requests_are_named(request_: dict[str, float], message: str) -> Non
 
 @pytest.mark.parametrize("candidates", ["auto", pd.Jacobi()])
 def test_candidates_are_a_sequence(candidates: object) -> None:
-    with pytest.raises(TypeError, match="candidates must be a sequence of solvers, got"):
+    with pytest.raises(TypeError, match=r"candidates .*got"):
         bar().tune(error=0.1, candidates=candidates)  # type: ignore[arg-type]
 
 
@@ -61,7 +61,7 @@ def test_states_that_are_not_finite_are_named() -> None:
     sim = bar()
     state = swinging(sim, batch=3)
     state.velocities[1, 4, 2] = math.nan
-    with pytest.raises(ValueError, match=r"state\.velocities .*got NaN or infinity in environment 1"):
+    with pytest.raises(ValueError, match=r"state\.velocities .*got NaN .*environment 1"):
         sim.tune(state, error=0.1)
 
 
@@ -73,7 +73,7 @@ def test_what_is_no_number_is_named(name: str) -> None:
     with torch.no_grad():
         sim.pin_hard[-1] = name != "pin_stiffness"  # of a hard pin no number counts
         array.view(-1)[-1] = math.nan
-    with pytest.raises(ValueError, match=rf"tune: {name} must be finite, got NaN or infinity at \["):
+    with pytest.raises(ValueError, match=rf"tune: {name} .*got NaN .*at \["):
         sim.tune(swinging(sim), error=0.1, forces=forces)
 
 
@@ -88,7 +88,7 @@ def test_a_singular_system_is_named() -> None:
 def test_a_scene_without_motion_is_named() -> None:
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (4, 1, 1))
     free = pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e5), pd.Gravity()), progress=False)
-    with pytest.raises(ValueError, match="no motion that needs solving"):
+    with pytest.raises(ValueError, match=r"tune: .*no motion"):
         free.tune(error=0.1)
     assert free.tuning_result is None
 

@@ -6,10 +6,8 @@ import os
 from pathlib import Path
 
 import pytest
-import torch
 
 from torchpd.common import memory
-from torchpd.simulation import stiff_pieces
 
 PHYSICAL = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 UNLIMITED = 9223372036854771712  # what version 1 says then
@@ -48,10 +46,3 @@ def test_the_least_limit_counts(groups: str, files: dict[str, object], least: in
 
 def test_without_control_groups_it_is_the_machine_s(tmp_path: Path) -> None:
     assert memory.host_memory(tmp_path) == PHYSICAL
-
-
-def test_rigid_pieces_ask_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(stiff_pieces, "host_memory", lambda: 12345)
-    with pytest.raises(ValueError, match=r"RigidPieces: .*16,000 B .*12,345 B"):
-        stiff_pieces._check_free_memory(1000, 1, torch.float32, torch.device("cpu"))
-    stiff_pieces._check_free_memory(100, 1, torch.float32, torch.device("cpu"))

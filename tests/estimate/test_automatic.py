@@ -412,10 +412,7 @@ def clip(*parts: Any, size: float = 1e-3) -> pd.Scene:
 @pytest.mark.parametrize("tolerance", [0.0, 1e-3])
 def test_steps_end(tolerance: float) -> None:
     """Where nothing would do "auto" takes a number that ends, and says what is left; a bound is no reason to warn."""
-    with pytest.warns(
-        pd.UnsolvedWarning,
-        match=r'0,000 iterations that "auto" takes at most leave a relative error of about (0\.\d|1) ',
-    ):
+    with pytest.warns(pd.UnsolvedWarning, match=r"Simulator: .*[14]0,000 .*about (0\.\d|1) .*time_step"):
         rough = pd.Simulator(clip(pd.Ground(-1e-3, friction=0.5)), solver="auto", tolerance=tolerance)
     assert isinstance(rough.solver, pd.Chebyshev)
     assert rough.iterations == MOST_OF_CHEBYSHEV * (PATIENCE if tolerance else 1)
@@ -439,7 +436,7 @@ def test_a_choice_that_is_not_capped_warns_when_it_has_become_too_few(tmp_path: 
         sim.prepare_solver()
     assert sim.iterations == PATIENCE * MOST_OF_LEVELS
     # one that is capped is told so again where it comes from a file
-    with pytest.warns(pd.UnsolvedWarning, match="takes at most"):
+    with pytest.warns(pd.UnsolvedWarning, match=r"Simulator: .*10,000 "):
         pd.Simulator(clip(pd.Ground(-1e-3, friction=0.5)), solver="auto").save(tmp_path / "clip")
-    with pytest.warns(pd.UnsolvedWarning, match=r'^Simulator\.load: the 10,000 iterations that "auto" takes at most'):
+    with pytest.warns(pd.UnsolvedWarning, match=r"^Simulator\.load: .*10,000 "):
         pd.Simulator.load(tmp_path / "clip")

@@ -214,7 +214,7 @@ def rewrite(file: Path, change: Callable[..., object]) -> None:
 
 
 def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no such simulation file: .*nothing"):
+    with pytest.raises(FileNotFoundError, match=r"file: .*nothing"):
         pd.Simulator.load(tmp_path / "nothing")
     with pytest.raises(IsADirectoryError, match=f"save: path must name a file, got the folder {tmp_path}"):
         pd.Simulator(everything()).save(tmp_path)
@@ -224,10 +224,10 @@ def test_missing_file(tmp_path: Path) -> None:
 
 def test_files_of_others_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text").write_text("a sentence that is long enough to be read as a header")
-    with pytest.raises(ValueError, match="not a safetensors file"):
+    with pytest.raises(ValueError, match=r"text .*safetensors"):
         pd.Simulator.load(tmp_path / "text")
     save_file({"weight": torch.zeros(2)}, tmp_path / "network")
-    with pytest.raises(ValueError, match="its metadata has no 'torchpd'"):
+    with pytest.raises(ValueError, match=r"metadata .*'torchpd'$"):
         pd.Simulator.load(tmp_path / "network")
     save_file({"weight": torch.zeros(2)}, tmp_path / "broken", metadata={"torchpd": "{"})
     with pytest.raises(ValueError, match="damaged: its metadata 'torchpd' cannot be read"):

@@ -93,7 +93,7 @@ def test_buffers_within_the_file_and_beside_it(tmp_path: Path) -> None:
     (tmp_path / "my data.bin").write_bytes(box().data)
     check_box(read(tmp_path / "b.gltf", box().text("my%20data.bin")))
     (tmp_path / "c.gltf").write_bytes(box().text("lost.bin"))
-    with pytest.raises(ValueError, match=r"c\.gltf .*'lost\.bin' is missing; it must lie beside the file"):
+    with pytest.raises(ValueError, match=r"c\.gltf .*'lost\.bin' is missing"):
         TriMesh.from_file(tmp_path / "c.gltf")
     (tmp_path / "below").mkdir()
     for uri in ("../my%20data.bin", str(tmp_path / "my data.bin"), "https://example.org/data.bin"):
@@ -165,7 +165,7 @@ def test_the_default_scene_is_read_and_the_rest_said(tmp_path: Path) -> None:
     assert read(tmp_path / "a.glb", scene.binary()).volume() == pytest.approx(18.0)
     scene.root |= {"scenes": [{"nodes": [0, 1]}, {"nodes": [1]}], "scene": 1}
     (tmp_path / "b.glb").write_bytes(scene.binary())
-    with pytest.warns(MeshWarning, match=r"of 2 scenes only the default.*meshes in no node of the scene \(1\)"):
+    with pytest.warns(MeshWarning, match=r"2 scenes .*default.*scene \(1\)"):
         surface = TriMesh.from_file(tmp_path / "b.glb")
     np.testing.assert_array_equal(surface.bounds, [[9, 0, 0], [10, 2, 3]])
 

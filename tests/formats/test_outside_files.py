@@ -143,7 +143,7 @@ def test_tetgen_files_have_no_more_rows_than_declared(tmp_path: Path, nodes: int
 def test_numbers_behind_the_cells_of_ugrid_are_said(tmp_path: Path) -> None:
     path = tmp_path / "a.ugrid"
     path.write_text(ugrid(cells=1))
-    with pytest.warns(MeshWarning, match="4 numbers behind its cells left out"):
+    with pytest.warns(MeshWarning, match=r"4 numbers .*left out"):
         TetMesh.from_file(path)
 
 
@@ -162,11 +162,11 @@ def test_points_that_no_cell_uses_need_not_be_finite(tmp_path: Path) -> None:
     """As depth cameras write them where they see nothing."""
     path = tmp_path / "a.msh"
     path.write_text(gmsh_2(nodes=6, more="6 nan nan nan\n"))
-    with pytest.warns(MeshWarning, match="1 vertices that no cell uses are not finite and were left out"):
+    with pytest.warns(MeshWarning, match=r"1 vertices .*not finite .*left out"):
         assert len(tets_in(path).vertices) == 5
     path = tmp_path / "a.obj"
     path.write_text("v nan nan nan\n" + rows(POINTS[:4], lead="v") + rows(FACES, shift=2, lead="f"))
-    with pytest.warns(MeshWarning, match="1 vertices that no cell uses are not finite"):
+    with pytest.warns(MeshWarning, match=r"1 vertices .*not finite"):
         assert len(TriMesh.from_file(path).vertices) == 4
 
 
@@ -242,5 +242,5 @@ def test_names_of_abaqus_in_quotes_hold_commas(tmp_path: Path) -> None:
 def test_errors_of_libraries_say_nothing_of_their_own_names(tmp_path: Path) -> None:
     path = tmp_path / "a.xdmf"
     path.write_text('<Xdmf Version="3.0"><Domain><Grid><Time Value="1"/></Grid></Domain></Xdmf>')
-    with pytest.raises(ValueError, match=r"a\.xdmf \(XDMF\): Unknown section 'Time'.; is the file complete"):
+    with pytest.raises(ValueError, match=r"a\.xdmf \(XDMF\): .*'Time'"):
         TetMesh.from_file(path)

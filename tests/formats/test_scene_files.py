@@ -94,7 +94,7 @@ def test_units_axes_and_texture_coordinates_of_collada(tmp_path: Path) -> None:
         '<input semantic="TEXCOORD" source="#t" offset="1" set="0"/><p>0 0 1 1 3 2</p></triangles>'
     )
     (tmp_path / "a.dae").write_text(collada(textured))
-    with pytest.warns(MeshWarning, match="5 of 8 vertices belong to no element"):
+    with pytest.warns(MeshWarning, match=r"5 of 8 vertices"):
         surface = TriMesh.from_file(tmp_path / "a.dae")
     np.testing.assert_array_equal(surface.uvs, [[0, 0], [1, 0], [1, 1]])
     for up, turned in (("Z_UP", BOX[:, [0, 2, 1]] * [1, 1, -1]), ("X_UP", BOX[:, [1, 0, 2]] * [-1, 1, 1])):

@@ -54,7 +54,7 @@ def test_instances_of_abaqus_stand_where_they_are_put(tmp_path: Path) -> None:
         "*INSTANCE, NAME=two, PART=A\n10., 0., 0.\n9., 0., 0., 9., 0., 1., 90.\n*END INSTANCE\n"
         "*NODE\n1, 9., 9., 9.\n*NSET, NSET=ref\n1\n*ELSET, ELSET=e, INSTANCE=one\n1\n*END ASSEMBLY\n"
     )
-    with pytest.warns(MeshWarning, match="part 'b', of which there is no instance.*1 is one, 2 is two"):
+    with pytest.warns(MeshWarning, match=r"part 'b'.*1 is one, 2 is two"):
         mesh = abaqus(tmp_path, PART.format("a", "") + PART.format("b", "") + places)
     # moved by 10 along x, then turned by 90 degrees about the vertical through x = 9
     turned = POINTS @ np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]) + [9, 1, 0]
@@ -80,7 +80,7 @@ def test_sets_of_abaqus_are_regions(tmp_path: Path) -> None:
     sets = "*ELSET, ELSET=Soft, GENERATE\n1, 1, 1\n*ELSET, ELSET=rest\n2\n*ELSET, ELSET=Hard\nREST\n"
     sets += "*ELSET, ELSET=all\n1,2\n"
     sections = "*SOLID SECTION, ELSET=HARD, MATERIAL=m\n1.\n*SOLID SECTION, ELSET=soft, MATERIAL=n\n"
-    with pytest.warns(MeshWarning, match=r"sets that are no regions left out: REST, ALL; .*1 is HARD, 2 is SOFT"):
+    with pytest.warns(MeshWarning, match=r"left out: REST, ALL; .*1 is HARD, 2 is SOFT"):
         mesh = abaqus(tmp_path, "*NODE\n" + NODES + TETS + sets + sections)
     assert mesh.regions is not None
     assert mesh.regions.tolist() == [2, 1]
@@ -252,7 +252,7 @@ def test_corners_of_permas_stand_between_nodes_on_edges(tmp_path: Path) -> None:
     rows = ["0 0 0", "1 0 0", "2 0 0", "1 1 0", "0 2 0", "0 1 0", "0 0 1", "1 0 1", "0 1 1", "0 0 2"]
     text = "$COOR\n" + "".join(f"{n} {row}\n" for n, row in enumerate(rows, 1))
     (tmp_path / "a.dato").write_text(text + "$ELEMENT TYPE=TET10\n1 1 2 3 4 5 6 7 8 9 10\n")
-    with pytest.warns(MeshWarning, match="1 tetra of higher order: corners kept") as said:
+    with pytest.warns(MeshWarning, match=r"1 tetra .*corners") as said:
         assert volume(TetMesh.from_file(tmp_path / "a.dato")) == pytest.approx(8 / 6)
     assert len(said) == 1
 

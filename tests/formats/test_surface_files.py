@@ -99,7 +99,7 @@ def test_an_obj_says_what_it_leaves_out(tmp_path: Path) -> None:
 def test_texture_coordinates_that_are_none_cost_no_surface(tmp_path: Path) -> None:
     lines = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt -nan(ind) 0\nvt 0\nf 1/1 2/2 3/3\n"
     (tmp_path / "a.obj").write_text(lines)
-    with pytest.warns(MeshWarning, match="texture coordinates left out: 1 are not finite"):
+    with pytest.warns(MeshWarning, match=r"texture coordinates .*1 .*not finite"):
         surface = TriMesh.from_file(tmp_path / "a.obj")
     assert surface.uvs is None
     assert len(surface.triangles) == 1
@@ -165,7 +165,7 @@ def test_elements_and_properties_beside_the_faces_are_skipped(tmp_path: Path) ->
     for number, face in enumerate(MIXED):
         body += struct.pack(f"<BB{len(face)}Ii{number % 3}f", 1, len(face), *face, number % 3, *[0.5] * (number % 3))
     (tmp_path / "a.ply").write_bytes(ply_head("binary_little_endian", lines) + body)
-    with pytest.warns(MeshWarning, match=r"left out: rows of the element 'camera' \(1\)$"):
+    with pytest.warns(MeshWarning, match=r"left out: .*'camera' \(1\)$"):
         surface = TriMesh.from_file(tmp_path / "a.ply")
     assert is_box(surface)
     np.testing.assert_array_equal(surface.uvs, BOX[:, :2])

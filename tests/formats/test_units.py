@@ -49,7 +49,7 @@ def test_a_declared_unit_is_not_overruled(tmp_path: Path) -> None:
 @pytest.mark.parametrize("unit", ["inch", 0.001])
 def test_other_units_are_named(unit: Any, tmp_path: Path) -> None:
     BAR.export(tmp_path / "bar.stl")
-    with pytest.raises(ValueError, match=rf"unit must be one of 'm', 'cm', 'mm', 'in', 'ft' or None, got {unit!r}"):
+    with pytest.raises(ValueError, match=rf"unit .*'m', 'cm', 'mm', 'in', 'ft' .*got {unit!r}"):
         pd.TriMesh.from_file(tmp_path / "bar.stl", unit=unit)
     with pytest.raises(ValueError, match="unit must be None for a TriMesh"):
         pd.tetrahedralize(pd.TriMesh.from_trimesh(BAR), unit="mm")

@@ -90,7 +90,7 @@ def test_units_and_axes_are_read(tmp_path: Path) -> None:
     assert surface.volume() == pytest.approx(6e-6)
     stage = Usd.Stage.CreateInMemory()
     add_box(stage)
-    with pytest.warns(MeshWarning, match="declares no metersPerUnit: its numbers count as metres"):
+    with pytest.warns(MeshWarning, match=r"no metersPerUnit"):
         surface = TriMesh.from_file(write(stage, tmp_path / "b.usda"))
     np.testing.assert_array_equal(surface.vertices, BOX)
 

@@ -247,7 +247,7 @@ def test_pieces_of_vtu_share_the_points_on_their_cut(tmp_path: Path) -> None:
     first = piece(ascii_arrays(POINTS[:4], TETS[:1]), 4, 1)
     second = piece(ascii_arrays(POINTS[1:], TETS[:1]), 4, 1)
     (tmp_path / "a.vtu").write_text(vtu(first + second))
-    with pytest.warns(MeshWarning, match="3 points that several pieces have"):
+    with pytest.warns(MeshWarning, match=r"3 points .*pieces"):
         mesh = tets_in(tmp_path / "a.vtu")
     assert len(mesh.boundary()) == 6
     # the same in files of their own
@@ -256,7 +256,7 @@ def test_pieces_of_vtu_share_the_points_on_their_cut(tmp_path: Path) -> None:
     names = '<Piece Source="one.vtu"/><Piece Source="two.vtu"/>'
     text = f'<VTKFile type="PUnstructuredGrid"><PUnstructuredGrid GhostLevel="0">{names}</PUnstructuredGrid></VTKFile>'
     (tmp_path / "a.pvtu").write_text(text)
-    with pytest.warns(MeshWarning, match="3 points that several pieces have"):
+    with pytest.warns(MeshWarning, match=r"3 points .*pieces"):
         assert len(tets_in(tmp_path / "a.pvtu").boundary()) == 6
     (tmp_path / "two.vtu").unlink()
     with pytest.raises(FileNotFoundError, match=r"a\.pvtu .*'two\.vtu' is missing"):
@@ -298,16 +298,12 @@ def test_regions_of_vtk(tmp_path: Path) -> None:
     path.write_text(
         VTK_TETS + "CELL_DATA 2\n" + floats + scalars.format("mine") + "POINT_DATA 5\nVECTORS u float\nshort"
     )
-    with pytest.warns(MeshWarning, match="regions are the array 'mine'.*beside the mesh could not be read"):
+    with pytest.warns(MeshWarning, match=r"'mine'.*could not be read"):
         regions = tets_in(path).regions
     assert regions is not None
     assert regions.tolist() == [7, 8]
     path.write_text(VTK_TETS + "CELL_DATA 2\n" + scalars.format("b") + "FIELD f 1\na 1 2 int\n1 2\n")
-<<<<<<< HEAD
-    with pytest.warns(MeshWarning, match=r"several cell arrays hold integers \(a, b\)"):
-=======
     with pytest.warns(MeshWarning, match=r"a\.vtk: .*integers \(a, b\)"):
->>>>>>> wpy2
         assert tets_in(path).regions is None
 
 
@@ -327,13 +323,13 @@ def test_polygonal_data(tmp_path: Path) -> None:
     )
     (tmp_path / "a.vtp").write_text(polys)
     assert len(TriMesh.from_file(tmp_path / "a.vtp").triangles) == 3
-    with pytest.raises(ValueError, match=r"a\.vtp must hold tetrahedra.*tetrahedralize"):
+    with pytest.raises(ValueError, match=r"a\.vtp .*tetrahedralize"):
         TetMesh.from_file(tmp_path / "a.vtp")
 
 
 def test_structured_grids_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.vtk").write_text(VTK_HEAD.format("STRUCTURED_GRID"))
-    with pytest.raises(ValueError, match=r"a\.vtk .*STRUCTURED_GRID is not read; save it as an unstructured grid"):
+    with pytest.raises(ValueError, match=r"a\.vtk .*STRUCTURED_GRID .*not read"):
         TetMesh.from_file(tmp_path / "a.vtk")
 
 
@@ -362,7 +358,7 @@ def test_tetgen(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"a\.node .*declares 3 tets"):
         TetMesh.from_file(tmp_path / "a.node")
     (tmp_path / "a.ele").unlink()
-    with pytest.raises(FileNotFoundError, match=r"a\.node .*a\.ele must lie beside it"):
+    with pytest.raises(FileNotFoundError, match=r"a\.node .*a\.ele"):
         TetMesh.from_file(tmp_path / "a.node")
 
 
@@ -395,7 +391,7 @@ def test_isaac_gym(tmp_path: Path) -> None:
     (tmp_path / "a.tet").write_text(f"# Tetrahedral mesh\n\n{vertices}\nt 0 1 2 3\nt 1 2 3 4\n")
     np.testing.assert_array_equal(tets_in(tmp_path / "a.tet").tets, TETS)
     (tmp_path / "b.tet").write_text(vertices + "t 0 1 2\n")
-    with pytest.raises(ValueError, match=r"b\.tet \(Isaac Gym\): .*`t i j k l`, got 't 0 1 2'"):
+    with pytest.raises(ValueError, match=r"b\.tet \(Isaac Gym\): .*got 't 0 1 2'"):
         TetMesh.from_file(tmp_path / "b.tet")
 
 
@@ -418,5 +414,5 @@ def test_cells_of_second_order_keep_their_corners(tmp_path: Path, suffix: str) -
     meshio.write(
         tmp_path / f"b{suffix}", meshio.Mesh(points, [("hexahedron20", np.arange(20)[None])]), file_format=kind
     )
-    with pytest.warns(MeshWarning, match=r"1 hexahedron of higher order.*1 hexahedron became 6 tets"):
+    with pytest.warns(MeshWarning, match=r"1 hexahedron .*higher order.*1 hexahedron became 6 tets"):
         assert len(TetMesh.from_file(tmp_path / f"b{suffix}").tets) == 6

@@ -347,10 +347,10 @@ def test_gradient_of_the_layer_is_the_adjoint() -> None:
 
 
 def test_errors_name_contract_and_fix() -> None:
-    with pytest.raises(ValueError, match=r"needs a closed surface.* got 12 edges of one patch; take apex='prism'"):
+    with pytest.raises(ValueError, match=r"closed .*got 12 .*apex='prism'"):
         pd.PatchBody(patches_on(sheet()), 1e4)
     inside_out = pd.TriMesh(ball().vertices, ball().triangles[:, ::-1])
-    with pytest.raises(ValueError, match=r"must bound a body from outside, got a volume of -3\.\d+ m\^3"):
+    with pytest.raises(ValueError, match=r"got .*-3\.\d+ m\^3"):
         pd.PatchBody(pd.FreeFormPatches.from_mesh(inside_out), 1e4)
     with pytest.raises(TypeError, match=r"patches .*got TriMesh"):
         pd.PatchBody(ball(), 1e4)
@@ -374,7 +374,7 @@ def test_errors_name_contract_and_fix() -> None:
 
 def test_flat_constraints_are_refused_by_name() -> None:
     # a layer thicker than the radius of the ball is inside out
-    with pytest.raises(ValueError, match=r"at least 0\.001 of their mean volume.* under patch \d+ .*lower thickness"):
+    with pytest.raises(ValueError, match=r"0\.001 .*got .*patch \d+ .*thickness"):
         pd.PatchBody(patches_on(ball()), 1e4, apex="prism", thickness=1.5)
     # two patches without thickness between them
     double = pd.TriMesh(

@@ -52,9 +52,7 @@ def test_normals_do_not_depend_on_how_faces_are_cut() -> None:
 
 def test_normals_that_cancel() -> None:
     """Two triangles back to back have no normal."""
-    with pytest.raises(
-        ValueError, match="the triangles around a vertex must not cancel, got vertex 0 without a normal"
-    ):
+    with pytest.raises(ValueError, match=r"triangles .*got vertex 0"):
         made(CORNERS[:3], [[0, 1, 2], [0, 2, 1]])
     up = torch.tensor([[0.0, 0.0, 1.0]] * 3, dtype=F64)
     assert len(made(CORNERS[:3], [[0, 1, 2], [0, 2, 1]], directors=up).triangles) == 2
@@ -88,7 +86,7 @@ def test_options(options: Any, error: Any, message: str) -> None:
 )
 def test_quadrics_that_are_not_finite(change: Any) -> None:
     q = lump()
-    with pytest.raises(ValueError, match=r"quadrics must be finite ellipsoids, got amplitude .* at 0"):
+    with pytest.raises(ValueError, match=r"quadrics .*got amplitude .* at 0"):
         made(CORNERS[:3], [[0, 1, 2]], pd.Quadrics(*change(q.amplitudes, q.centres, q.factors)))
 
 

@@ -46,10 +46,10 @@ def test_errors(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no such file of patches"):
         pd.FreeFormPatches.load(file)
     file.write_bytes(b"nothing")
-    with pytest.raises(ValueError, match="holds no patches: not a safetensors file"):
+    with pytest.raises(ValueError, match=r"no patches: .*safetensors"):
         pd.FreeFormPatches.load(file)
     save_file({"a": torch.zeros(1)}, file)
-    with pytest.raises(ValueError, match=r"its metadata has no 'torchpd.patches'"):
+    with pytest.raises(ValueError, match=r"metadata .*'torchpd\.patches'"):
         pd.FreeFormPatches.load(file)
 
     patches.save(file)
@@ -61,7 +61,7 @@ def test_errors(tmp_path: Path) -> None:
         save_file(kept, file, metadata={"torchpd.patches": json.dumps({**record, **change})})
 
     write({"format": 2, "written_by": "torchpd 9"})
-    with pytest.raises(ValueError, match=r"format 2, written by torchpd 9; .* install a newer torchpd"):
+    with pytest.raises(ValueError, match=r"format 2, .*torchpd 9; .*install"):
         pd.FreeFormPatches.load(file)
     write({}, "quadrics.factors")
     with pytest.raises(ValueError, match=r".*version: 'quadrics.factors'"):

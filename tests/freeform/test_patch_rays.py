@@ -284,7 +284,7 @@ def test_refusals() -> None:
     with pytest.raises(TypeError, match=r"patches .*got TriMesh"):
         pd.PatchRays(ball())  # type: ignore[arg-type]
     for level in (0, 33, 2.0, True):
-        with pytest.raises(ValueError, match=r"level must be a whole number in 1\.\.32"):
+        with pytest.raises(ValueError, match=r"level .*1\.\.32"):
             pd.PatchRays(patches, level)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match=r"origins .*got torch\.float32"):
         rays.cast(o.float(), d)

@@ -159,7 +159,7 @@ def test_inverted_tets_are_turned_and_reported() -> None:
     mesh = shapes.box((1.0, 1.0, 1.0), (2, 2, 2))
     tets = mesh.tets.copy()
     tets[::3] = tets[::3][:, [1, 0, 2, 3]]
-    with pytest.warns(MeshWarning, match="16 of 48 tets had inverted winding"):
+    with pytest.warns(MeshWarning, match=r"16 of 48 tets .*winding"):
         repaired = TetMesh(mesh.vertices, tets)
     assert repaired.flipped == 16
     assert mesh.flipped == 0
@@ -169,19 +169,19 @@ def test_inverted_tets_are_turned_and_reported() -> None:
 
 def test_unreferenced_vertices_are_dropped_on_demand() -> None:
     vertices = np.vstack([[[9.0, 9, 9]], CORNERS, [[8.0, 8, 8]]])
-    with pytest.warns(MeshWarning, match="2 of 6 vertices belong to no element"):
+    with pytest.warns(MeshWarning, match=r"2 of 6 vertices"):
         mesh = TetMesh(vertices, TET + 1, drop_unreferenced=True)
     np.testing.assert_array_equal(mesh.vertices, CORNERS)
     np.testing.assert_array_equal(mesh.tets, TET)
 
 
 def test_degenerate_elements_are_dropped_on_demand() -> None:
-    with pytest.warns(MeshWarning, match="2 of 3 tets have no volume"):
+    with pytest.warns(MeshWarning, match=r"2 of 3 tets .*volume"):
         mesh = TetMesh(CORNERS, [[0, 1, 1, 3], [0, 1, 2, 3], [0, 1, 2, 2]], drop_degenerate=True)
     np.testing.assert_array_equal(mesh.tets, TET)
-    with pytest.raises(ValueError, match="no tet has a volume"), pytest.warns(MeshWarning):
+    with pytest.raises(ValueError, match=r"TetMesh\.tets: no .*volume"), pytest.warns(MeshWarning):
         TetMesh(FLAT, TET, drop_degenerate=True)
-    with pytest.warns(MeshWarning, match="1 of 2 triangles name a vertex twice"):
+    with pytest.warns(MeshWarning, match=r"1 of 2 triangles .*twice"):
         surface = TriMesh(CORNERS[:3], [[0, 0, 1], [0, 1, 2]], uvs=CORNERS[:3, :2], drop_degenerate=True)
     assert len(surface.triangles) == 1
 
@@ -330,14 +330,14 @@ def test_a_tet_that_comes_twice_is_refused_or_left_out() -> None:
     tets = np.concatenate([mesh.tets, turned])
     with pytest.raises(ValueError, match=r"tets .*got \[10, 14, 1, 11\] at 48 \(3 in all\)"):
         TetMesh(mesh.vertices, tets)
-    with pytest.warns(MeshWarning, match="3 of 51 tets come twice and were left out"):
+    with pytest.warns(MeshWarning, match=r"3 of 51 tets .*left out"):
         once = TetMesh(mesh.vertices, tets, drop_degenerate=True)
     np.testing.assert_array_equal(once.tets, mesh.tets)
 
 
 def test_an_embedding_must_belong_to_its_mesh() -> None:
     mesh, other = jittered_box(), shapes.single_tet()
-    with pytest.raises(ValueError, match="the embedding must belong to this mesh"):
+    with pytest.raises(ValueError, match=r"TetMesh\.with_embedding: .*embedding .*this mesh"):
         mesh.with_embedding(embed_triangles(other.vertices, other.tets, other.boundary()))
     assert mesh.with_embedding(None).embedding is None
 

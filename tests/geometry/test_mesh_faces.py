@@ -355,7 +355,7 @@ def test_a_stray_node_of_a_file_leaves_the_surface_in_place(tmp_path: Path) -> N
     numbers = np.array([0, 1, 2, 4, 5, 6, 7, 8])
     triangles = np.vstack([numbers[CUBE.boundary()], [[0, 1, 3]]])
     meshio.Mesh(points, [("tetra", numbers[CUBE.tets]), ("triangle", triangles)]).write(tmp_path / "stray.vtu")
-    with pytest.warns(MeshWarning, match="1 of 13 triangles have corners that belong to no tet, and were left out"):
+    with pytest.warns(MeshWarning, match=r"1 of 13 triangles .*no tet.*left out"):
         mesh = TetMesh.from_file(tmp_path / "stray.vtu")
     assert mesh.embedding is not None
     assert mesh.embedding.surface.volume() == pytest.approx(1.0, rel=1e-14)

@@ -77,7 +77,7 @@ def test_scenes_are_joined_with_their_places() -> None:
     surface = TriMesh.from_trimesh(scene)
     np.testing.assert_allclose(surface.bounds, [[-0.5, -0.5, -0.5], [3.5, 0.5, 0.5]])
     scene.add_geometry(trimesh.PointCloud(np.zeros((1, 3))))
-    with pytest.warns(MeshWarning, match="without triangles left out: PointCloud"):
+    with pytest.warns(MeshWarning, match=r"left out: PointCloud"):
         assert len(TriMesh.from_trimesh(scene).triangles) == 24
     with pytest.raises(TypeError, match=r"surface .*got int"):
         TriMesh.from_trimesh(3)
@@ -103,9 +103,7 @@ def test_files_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     corners = "".join(f"v {x} {y} {z}\n" for x, y, z in CORNERS[:3]) + "vt 0 0\nvt 1 0\nvt 0 1\nvt 1 1\n"
     (tmp_path / "textured.obj").write_text(corners + "f 1/1 2/2 3/4\n")
     assert len(TriMesh.from_file(tmp_path / "textured.obj").triangles) == 1
-    with pytest.raises(
-        ValueError, match=r"textured\.obj must hold tetrahedra.*got a surface .*torchpd\.tetrahedralize"
-    ):
+    with pytest.raises(ValueError, match=r"textured\.obj .*got a surface .*torchpd\.tetrahedralize"):
         TetMesh.from_file(tmp_path / "textured.obj")
     shapes.single_tet().to_file(tmp_path / "tets.vtk")
     with pytest.raises(ValueError, match="holds no triangles"):
@@ -118,10 +116,10 @@ def test_a_file_says_what_it_leaves_out(tmp_path: Path) -> None:
         warnings.simplefilter("error")
         mesh.to_file(tmp_path / "bare.vtu")
     carrying = mesh.with_embedding(embed_triangles(mesh.vertices, mesh.tets, mesh.boundary()))
-    with pytest.warns(MeshWarning, match=r"a\.vtu omits the embedded surface.*Simulator\.save"):
+    with pytest.warns(MeshWarning, match=r"a\.vtu .*surface.*Simulator\.save"):
         carrying.to_file(tmp_path / "a.vtu")
     partly = TetMesh(mesh.vertices, mesh.tets, fill=[0.5])
-    with pytest.warns(MeshWarning, match=r"b\.vtu omits the fill"):
+    with pytest.warns(MeshWarning, match=r"b\.vtu .*fill"):
         partly.to_file(tmp_path / "b.vtu")
 
 
@@ -183,7 +181,7 @@ def test_formats_without_regions_say_so_and_keep_the_tets(tmp_path: Path, name: 
 
 def test_numbers_that_do_not_fit_a_format_are_refused(tmp_path: Path) -> None:
     mesh = TetMesh([[-1.23456789012e-3, 0.0, 0.0], *CORNERS[1:]], TET)  # a column of .nas is 16 characters wide
-    with pytest.raises(ValueError, match=r"cannot write .*a\.nas through meshio: its numbers do not fit the format"):
+    with pytest.raises(ValueError, match=r"cannot write .*a\.nas .*numbers"):
         mesh.to_file(tmp_path / "a.nas")
 
 

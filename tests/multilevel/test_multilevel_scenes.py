@@ -385,7 +385,7 @@ def test_ops_want_the_arrays_of_the_preconditioner() -> None:
     state, ops = sim.rest_state(), torch.ops.torchpd
     numbers = {**pd.Multilevel().settings(), "iterations": 2, "time_step": 0.01, "tolerance": 0.0}
     plan = list(sim.plan.arrays)
-    with pytest.raises(ValueError, match=r"plan has no multilevel preconditioner; a Simulator with solver=Multilevel"):
+    with pytest.raises(ValueError, match=r"plan .*no .*preconditioner; .*solver=Multilevel"):
         ops.step(*state, None, None, sim.material(), plan, **numbers, inertial=False, report=False)
     with pytest.raises(ValueError, match=r"plan has no multilevel preconditioner"):
         ops.precondition(state.positions, plan)

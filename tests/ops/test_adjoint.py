@@ -405,7 +405,7 @@ def test_unsolved_step_warns() -> None:
     crumpled = (
         0.02 * torch.randn(state[0].shape, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
     ).requires_grad_()
-    with pytest.warns(UserWarning, match="adjoint of a step has no solution in 2 of 2 environments"):
+    with pytest.warns(UserWarning, match=r"adjoint .*2 of 2 environments"):
         sim(pd.State(crumpled, state.velocities)).positions.sum().backward()
     # still a gradient of sensible size: the majoriser's largest inverse eigenvalue times inertia is at most one
     assert 0.0 < float(crumpled.grad.norm()) <= 1.1 * crumpled.numel() ** 0.5

@@ -132,9 +132,7 @@ def test_elastic_diagonal_refuses_a_gradient() -> None:
     sim, _ = small(torch.float32)
     stiffness = sim.stiffness.detach().requires_grad_()
     diagonal = ops.elastic_diagonal(material_with(sim, stiffness), plan_of(sim), weighted=True)
-    with pytest.raises(
-        RuntimeError, match="the elastic diagonal, a preconditioner, has no derivative; detach stiffness"
-    ):
+    with pytest.raises(RuntimeError, match=r"no derivative; detach stiffness"):
         diagonal.sum().backward()
     stiffness, masses, *rest = sim.material()
     masses = masses.detach().requires_grad_()

@@ -300,9 +300,7 @@ def test_friction_that_jams_is_said() -> None:
     solution, right, inverse = noise(push, 1), noise(push, 2), 1.0 / sim.masses
     solved, jams = torch.tensor([0.0, 0.0], dtype=torch.float64), torch.tensor([0.0, 0.1], dtype=torch.float64)
     given = (state.positions, right, inverse, None, material, list(sim.plan.arrays))
-    with pytest.warns(
-        UserWarning, match=r"step with sliding friction is not solved in 1 of 2 environments .*1.0e-01.*jams"
-    ):
+    with pytest.warns(UserWarning, match=r"friction .*1 of 2 environments .*1\.0e-01.*jams"):
         found = torch.ops.torchpd.adjoint_fallback(solution, solved, jams, *given, time_step=sim.time_step)
     assert torch.equal(found, solution)
     with warnings.catch_warnings():

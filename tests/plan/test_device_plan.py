@@ -337,7 +337,7 @@ def test_bad_arguments_are_refused() -> None:
     values = values_of("one tet")
     x, tets, piece = values.rest_positions, values.tets, np.zeros(4, dtype=np.int32)
     for patches in (0, -1, 2):
-        with pytest.raises(ValueError, match=rf"patches must lie in 1\.\.1, the number of tetrahedra, got {patches}"):
+        with pytest.raises(ValueError, match=rf"patches .*got {patches}"):
             compile_device_plan(values, patches, 0, torch.float32)
     for kernel in (-1, 4):
         refusal = f"kernel must be 0, 1, 2 or 3, got {kernel}"
@@ -348,10 +348,10 @@ def test_bad_arguments_are_refused() -> None:
     with pytest.raises(ValueError, match=r"dtype .*got torch\.float16"):
         compile_device_plan(values, 1, 0, torch.float16)
     for bad in (4, -1, 2**40):
-        with pytest.raises(IndexError, match="tets refer to vertices that positions does not have"):
+        with pytest.raises(IndexError, match=r"tets .*positions"):
             _C.build_device_plan(x, np.array([[0, 1, 2, bad]]), 1, BLOCK, False, piece, lambda done: None)
-    with pytest.raises(ValueError, match=r"piece must be int32 \[vertices\], .*positions"):
+    with pytest.raises(ValueError, match=r"piece .*int32 \[vertices\]"):
         _C.build_device_plan(x, tets, 1, BLOCK, False, piece[:3], lambda done: None)
     for number in (-2, 4):
-        with pytest.raises(ValueError, match="piece must hold numbers of pieces, counted from 0, or -1"):
+        with pytest.raises(ValueError, match=r"piece .*from 0, or -1"):
             _C.build_device_plan(x, tets, 1, BLOCK, False, np.full(4, number, dtype=np.int32), lambda done: None)

@@ -261,11 +261,11 @@ def test_indices_are_checked_before_memory_is_touched() -> None:
     for bad in (8, -1, 2**40):
         wrong = tets.copy()
         wrong[3, 2] = bad
-        with pytest.raises(IndexError, match="tets refer to vertices that positions does not have"):
+        with pytest.raises(IndexError, match=r"tets .*positions"):
             _C.build_plan(vertices, wrong, 128, lambda done: None)
-    with pytest.raises(ValueError, match=r"positions must be float64 \[vertices, 3\]"):
+    with pytest.raises(ValueError, match=r"positions .*float64 \[vertices, 3\]"):
         _C.build_plan(vertices[:, :2].copy(), tets, 128, lambda done: None)
-    with pytest.raises(ValueError, match=r"tets must be int64 \[count > 0, 4\]"):
+    with pytest.raises(ValueError, match=r"tets .*int64 \[count > 0, 4\]"):
         _C.build_plan(vertices, tets[:0], 128, lambda done: None)
 
 

@@ -355,7 +355,7 @@ def test_one_class_for_both_plans(kernel: str, dtype: torch.dtype) -> None:
     assert plan.dtype == dtype
     assert plan.to(dtype=dtype).dtype == dtype
     other = torch.float64 if dtype == torch.float32 else torch.float32
-    with pytest.raises(ValueError, match=rf"Plan.to: dtype must be {dtype} for a GPU plan, got {other}"):
+    with pytest.raises(ValueError, match=rf"Plan.to: dtype .*{dtype} .*got {other}"):
         plan.to(dtype=other)
     assert plan.bytes == sum(array.numel() * array.element_size() for array in plan.arrays)
     assert len(DEVICE_SIZES) == len(plan.sizes)

@@ -201,7 +201,7 @@ def test_batches_of_the_material_must_agree() -> None:
 
 def test_what_is_no_material_is_refused(sim: pd.Simulator) -> None:
     for value in ("soft", None, [[1.0], [1.0, 2.0]], {}):
-        with pytest.raises(TypeError, match="set_material: stiffness must be a number or a tensor, got"):
+        with pytest.raises(TypeError, match=r"set_material: stiffness .*got"):
             sim.set_material(stiffness=value)  # type: ignore[arg-type]
     for loaded in (None, "file.pt", 3):
         with pytest.raises(TypeError, match=r"load_state_dict: state_dict .*mapping .*, got"):

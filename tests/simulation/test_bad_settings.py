@@ -77,7 +77,7 @@ def test_settings_that_are_replaced_are_checked() -> None:
     sim = small_simulator()
     before = sim.iterations, sim.tolerance, sim.time_step, sim.kernel
     for value in ("a", None, -1, math.nan):
-        with pytest.raises(ValueError, match=rf"time_step must be positive and finite \[s\], got {value!r}"):
+        with pytest.raises(ValueError, match=rf"time_step .*got {value!r}"):
             sim.time_step = value  # type: ignore[assignment]
     with pytest.raises(ValueError, match=r"kernel .*got \'foo\'"):
         sim.kernel = "foo"
@@ -196,7 +196,7 @@ def test_records_that_are_not_there_are_refused(sim: pd.Simulator) -> None:
         sim.rollout(state, 0).state()
     track = sim.rollout(state, 2)
     for record in (2, -3):
-        with pytest.raises(IndexError, match=rf"Track\.state: record must lie in -2\.\.1, got {record}"):
+        with pytest.raises(IndexError, match=rf"Track\.state: record .*got {record}"):
             track.state(record)
 
 
@@ -285,11 +285,11 @@ def test_what_is_no_state_is_refused(state: Any, sim: pd.Simulator) -> None:
         lambda: sim.tune(state, error=0.1) if state is not None else sim(state),
     ]
     for call in calls:
-        with pytest.raises(TypeError, match=r"state must be a State, positions and velocities \[B, 27, 3\], .*got"):
+        with pytest.raises(TypeError, match=r"state .*\[B, 27, 3\], .*got"):
             call()
 
 
 def test_parts_of_what_is_no_state_are_named(sim: pd.Simulator) -> None:
     rest = sim.rest_state()
-    with pytest.raises(TypeError, match="got State of ndarray and ndarray; rest_state"):
+    with pytest.raises(TypeError, match=r"got State .*ndarray; rest_state"):
         sim(pd.State(*(part.numpy() for part in rest)))  # type: ignore[arg-type]

@@ -92,9 +92,9 @@ def test_what_they_cannot_be_is_said_and_changes_nothing() -> None:
         with pytest.raises(kind, match=message):
             sim.set_material(**arrays)  # type: ignore[arg-type]
     assert all(torch.equal(now, then) for now, then in zip(sim.material(), before, strict=True))
-    with pytest.raises(ValueError, match="radius belongs to spheres, and the scene has none"):
+    with pytest.raises(ValueError, match=r"radius .*none"):
         cube(pd.Ground()).set_material(radius=1.0)
-    with pytest.raises(ValueError, match="friction belongs to grounds and spheres, and the scene has none"):
+    with pytest.raises(ValueError, match=r"friction .*none"):
         cube().set_material(friction=1.0)
 
 

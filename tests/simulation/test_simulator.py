@@ -216,7 +216,7 @@ def test_values_and_meta_are_not_mixed() -> None:
         with pytest.raises(TypeError, match=r"velocities .*got torch\.float32 on meta"):
             call(pd.State(state.positions, shapes.velocities))
     stiffness = {"stiffness": sim.stiffness.to("meta")}
-    with pytest.raises(RuntimeError, match=r'torchpd::step: .* on cpu and some on "meta"'):
+    with pytest.raises(RuntimeError, match=r'torchpd::step: .*cpu .*"meta"'):
         torch.func.functional_call(sim, stiffness, (state,))
 
 
@@ -273,7 +273,7 @@ def test_errors_of_others_are_left_alone() -> None:
 
 def test_capture_wants_a_gpu() -> None:
     sim = simulate(torch.float32)
-    with pytest.raises(RuntimeError, match=r'capture: .* got cpu: move it with \.to\("cuda"\)'):
+    with pytest.raises(RuntimeError, match=r'capture: .*got cpu.*\.to\("cuda"\)'):
         sim.capture(moving(sim))
 
 
