@@ -79,7 +79,7 @@ def test_a_replay_for_another_plan_is_refused(kernel: str, precision: str) -> No
     own, eager = twins(start, 2)
     step, plan = sim.capture(own), sim.plan
     sim.plan = replace(plan)
-    with pytest.raises(RuntimeError, match="capture it again"):
+    with pytest.raises(RuntimeError, match="replay: the plan"):
         step.replay()
     sim.plan = plan
     step.replay()

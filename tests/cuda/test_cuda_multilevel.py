@@ -290,7 +290,7 @@ def test_solvers_can_be_exchanged() -> None:
     assert same_bits(sim(start), plain)
     sim_with_levels, _ = small(torch.float64, GPU, solver=pd.Multilevel())
     block, _ = small(torch.float64, GPU, kernel="block")
-    with pytest.raises(ValueError, match="Multilevel runs with kernel=\"stream\" on a GPU, got kernel='block'"):
+    with pytest.raises(ValueError, match=r"kernel .*'block'"):
         block.solver = pd.Multilevel()
     assert block.solver == pd.Chebyshev()
     levels = sim_with_levels.plan.arrays[-len(MULTILEVEL_TABLE) :]
