@@ -35,7 +35,7 @@ int main() {{
   for (int n = 0; n < pairs; ++n) {{
     for (int i = n < pd::history ? 0 : n - pd::history + 1; i <= n; ++i)
       ring.product[i % pd::history][n % pd::history] = dot(s[i], y[n]);
-    ring.admit(n % pd::history, n != pairs - 2, dot(s[n], s[n]), dot(y[n], y[n]));
+    ring.admit(n % pd::history, n != pairs - 2, dot(s[n], y[n]), dot(s[n], s[n]), dot(y[n], y[n]));
   }}
   const int newest = (pairs - 1) % pd::history;
   const auto number = [&](int place) {{ return pairs - 1 - (newest - place + pd::history) % pd::history; }};

@@ -154,7 +154,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
         pairs.s_dot_g[j] = total[history + j];
       }
       const bool teaches = k > 0 && search_[lane].updates_pairs();
-      pairs.admit(newest_, teaches, total[2 * history], total[2 * history + 2]);
+      pairs.admit(newest_, teaches, total[newest_], total[2 * history], total[2 * history + 2]);
       if (search_[lane].clears_pairs()) pairs.clear();
       pairs.first_loop(newest_);
     }

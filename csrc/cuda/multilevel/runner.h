@@ -345,8 +345,9 @@ class MultilevelRunner {
       }
     }
     if (j != 0) return;
-    pairs.admit(newest_, k > 0 && c_.outer.updates_pairs(), c_.total[dots_change],
-                c_.total[dots_yy]);
+    // s.y of c_.total: another lane has just written that of the table
+    pairs.admit(newest_, k > 0 && c_.outer.updates_pairs(), c_.total[dots_sy + newest_],
+                c_.total[dots_change], c_.total[dots_yy]);
     if (c_.outer.clears_pairs()) pairs.clear();
   }
 

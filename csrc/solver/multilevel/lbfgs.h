@@ -85,9 +85,8 @@ struct SecantPairs {
     for (bool& v : valid) v = false;
   }
 
-  // Admits the pair at `newest`, whose products are stored, by |s|^2 and |y|^2; `teaches`: it may be used.
-  PD_HD void admit(int newest, bool teaches, double ss, double yy) {
-    const double curvature = product[newest][newest];
+  // Admits the pair at `newest`, whose products are stored, by its s.y, |s|^2 and |y|^2; `teaches`: it may be used.
+  PD_HD void admit(int newest, bool teaches, double curvature, double ss, double yy) {
     inverse[newest] = 1 / curvature;
     const double least = least_curvature * least_curvature * ss * yy;
     valid[newest] =
