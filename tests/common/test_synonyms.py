@@ -62,6 +62,13 @@ def test_other_unknown_arguments_get_the_list() -> None:
     assert (caught.value.name, hasattr(pd, "Wind")) == ("Wind", False)
 
 
+def test_errors_of_python_name_the_class_of_users() -> None:
+    with pytest.raises(TypeError, match=r"^Simulator\.forward\(\) .*'dt'"):
+        SIM(SIM.rest_state(), dt=0.1)
+    with pytest.raises(TypeError, match=r"^Simulator\.contact_forces\(\) "):
+        SIM.contact_forces()
+
+
 def test_dir_shows_what_is_public() -> None:
     shown = {name for name in dir(pd) if not name.startswith("__")}
     assert shown == {name for name in pd.__all__ if not name.startswith("__")}

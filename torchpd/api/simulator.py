@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -189,6 +190,13 @@ class Simulator(Stepper):
             trained=[name for name, value in material.items() if value.requires_grad],
             reference=stored_reference(self.plan.arrays) if has_preconditioner(self.plan.arrays) else None,
         )
+
+
+# Python's errors about arguments name the class that users know.
+for _base in Simulator.__mro__[1:]:
+    for _name, _method in vars(_base).items():
+        if _base.__module__.startswith("torchpd.") and inspect.isfunction(_method):
+            _method.__qualname__ = f"Simulator.{_name}"
 
 
 def _restored(saved: SavedSimulation) -> Simulator:
