@@ -103,7 +103,7 @@ struct Cpu {
 TORCH_LIBRARY(torchpd, m) {
   // A CUDA graph of torch.compile returns tensors that it was given and that others need, such as backward. It cannot
   // return CPU tensors, and every plan has its counts there. So no op that takes a plan may be in such a graph.
-  // Graphs of capture.py may hold them.
+  // Graphs of simulation/cuda_graph.py may hold them.
   const std::vector<at::Tag> between_graphs{at::Tag::cudagraph_unsafe};
   const auto with_plan = [&](const std::string& schema) { m.def(schema.c_str(), between_graphs); };
   with_plan(

@@ -244,7 +244,7 @@ def test_former_names_work_and_warn(tuned: tuple[pd.Simulator, TuningResult]) ->
         assert [warning.filename for warning in caught] == [__file__]
     with pytest.warns(DeprecationWarning, match=r"^Simulator\.promise .*tuning_result:"):
         assert sim.promise is sim.tuning_result
-    with pytest.warns(DeprecationWarning, match=r"^Model\.numbers .*step_settings:"):
+    with pytest.warns(DeprecationWarning, match=r"^Simulator\.numbers .*step_settings:"):
         assert sim.numbers(inertial=False, report=False) == sim.step_settings(inertial=False, report=False)
     with pytest.warns(DeprecationWarning, match="tuning_result"):
         sim.promise = None

@@ -74,7 +74,7 @@ def test_others_take_hardly_more(name: str) -> None:
 
 
 class Corotated:
-    """solver/corotation.h in plain NumPy: M, and from the third iterate on what stands in for it."""
+    """solver/multilevel/deflation.h in plain NumPy: M, and from the third iterate on what stands in for it."""
 
     def __init__(self, case: Case, relaxation: float) -> None:
         self.problem, self.relaxation = case.problem(), relaxation

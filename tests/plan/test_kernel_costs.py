@@ -120,7 +120,7 @@ def test_benchmark_takes_the_quickest_of_the_kernels_that_fit(monkeypatch: pytes
     milliseconds = {"block": 3.0, "cluster": math.inf, "grid": 2.0, "stream": 9.0}
     timed = []
 
-    def time(prepare: partial[Any]) -> float:
+    def time(prepare: partial[Any], device: torch.device) -> float:
         timed.append(prepare.args[0].kernel)
         return milliseconds[timed[-1]]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -338,3 +339,35 @@ def test_numbers_are_no_states() -> None:
     for step in (sim, sim.step_, lambda state: sim.rollout(state, 2), sim.energy):
         with pytest.raises(ValueError, match=r"must be \[B, 45, 3\], got \[\]"):
             step(pd.State(number, number))
+
+
+def test_the_elastic_gradient_depends_on_the_stiffness_alone() -> None:
+    """Neither a gradient nor a change in place of other arrays concerns it."""
+    sim = pd.Simulator(pd.Scene(pd.Solid(pd.shapes.box((1, 1, 1), (1, 1, 1)), 1e5)), progress=False)
+    x = (1.1 * sim.rest_state().positions).requires_grad_()
+    energy = sim.gradient(x).square().sum()
+    sim.masses.requires_grad_()
+    assert not sim.gradient(x.detach()).requires_grad
+    with torch.no_grad():
+        sim.damping.fill_(0.1)
+    energy.backward()
+    assert x.grad is not None
+
+
+def test_auto_in_inference_mode_leaves_tensors_that_can_be_trained() -> None:
+    body = pd.Solid(pd.shapes.box((3.0, 0.6, 0.6), (30, 6, 6)), 1e8)
+    scene = pd.Scene(body, pd.Pin(body, body.mesh.vertices[:, 0] < 1e-6), pd.Gravity())
+    with torch.inference_mode():
+        sim = pd.Simulator(scene, 1 / 30, solver="auto", progress=False)
+    assert isinstance(sim.solver, pd.Multilevel)
+    assert not any(array.is_inference() for array in sim.plan.arrays)
+
+
+def test_an_unsolved_warning_that_is_an_error_is_raised_once() -> None:
+    body = pd.Solid(pd.shapes.box((3.0, 0.3, 0.3), (20, 2, 2)), 1e4)
+    sim = pd.Simulator(pd.Scene(body, pd.Pin(body, body.mesh.vertices[:, 0] < 1e-6), pd.Gravity()), progress=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(pd.UnsolvedWarning):
+            sim.set_material(stiffness=1e9)
+        sim.set_material(stiffness=2e9)

@@ -73,6 +73,7 @@ class Simulator(Stepper):
 
     tuning_result: TuningResult | None
     promise = Renamed("tuning_result")
+    numbers = Renamed("step_settings")
 
     def extra_repr(self) -> str:
         return describe(self, self.tuning_result)

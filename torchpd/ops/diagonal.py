@@ -9,12 +9,18 @@ from torch import Tensor
 
 from ..common.tables import MATERIAL_TABLE
 
-__all__ = ["named_material", "pinned_vertices", "step_diagonal"]
+__all__ = ["elastic_material", "named_material", "pinned_vertices", "step_diagonal"]
 
 
 def named_material(arrays: Sequence[Tensor]) -> dict[str, Tensor]:
     """Material arrays by name."""
     return {row.name: array for row, array in zip(MATERIAL_TABLE, arrays, strict=True)}
+
+
+def elastic_material(stiffness: Tensor) -> list[Tensor]:
+    """Material for the ops of the elastic energy, which read and keep the stiffness alone."""
+    unread = torch.empty(0, dtype=stiffness.dtype, device=stiffness.device)
+    return [stiffness if row.name == "stiffness" else unread for row in MATERIAL_TABLE]
 
 
 def pinned_vertices(plan: Sequence[Tensor]) -> Tensor:

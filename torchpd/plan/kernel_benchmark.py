@@ -38,9 +38,11 @@ def fastest_plan(plans: Iterator[Plan], scene: CompiledScene, dtype: torch.dtype
     key = (
         torch.cuda.get_device_name(device), dtype, len(values.tets), len(values.rest_positions), len(values.planes),
         len(values.spheres), len(values.pin_vertices), scene.environments, scene.iterations, scene.solver,
+        *((plan.kernel, plan.patches) for plan in candidates),
     )  # fmt: skip
     if key not in _TIMES:
-        _TIMES[key] = {str(plan.kernel): _milliseconds(partial(_step, plan, scene, device)) for plan in candidates}
+        steps = {str(plan.kernel): partial(_step, plan, scene, device) for plan in candidates}
+        _TIMES[key] = {kernel: _milliseconds(step, device) for kernel, step in steps.items()}
     times = _TIMES[key]
     best = min(candidates, key=lambda plan: times[str(plan.kernel)])
     words = ", ".join(f"{kernel} {time:.3g} ms" for kernel, time in sorted(times.items(), key=lambda item: item[1]))
@@ -65,12 +67,13 @@ def _step(plan: Plan, scene: CompiledScene, device: torch.device) -> Step:
     return lambda: torch.ops.torchpd.step(rest, still, None, None, material, arrays, **settings)
 
 
-def _milliseconds(prepare: Callable[[], Step]) -> float:
+def _milliseconds(prepare: Callable[[], Step], device: torch.device) -> float:
     """Median milliseconds per step; inf if memory does not suffice."""
     try:
-        step = prepare()
-        step()  # the first step loads the kernel
-        return statistics.median(_timed(step) for _ in range(_REPETITIONS))
+        with torch.cuda.device(device):
+            step = prepare()
+            step()  # the first step loads the kernel
+            return statistics.median(_timed(step) for _ in range(_REPETITIONS))
     except torch.cuda.OutOfMemoryError:
         return float("inf")
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..common.checks import check_whole
-from ..common.synonyms import Renamed, check_arguments
+from ..common.synonyms import check_arguments
 from ..estimate.solver_choice import Choice
 from ..plan.compiled import persistent_tensors
 from ..plan.cpu_plan import Plan, compile_plan
@@ -135,7 +135,8 @@ class Model(nn.Module):
         if device is not None:  # first, since "auto" chooses for it
             self.to(device)
         if is_auto(solver):
-            self._take(choose(self.compiled, None if iterations is None else self.iterations))
+            with persistent_tensors():
+                self._take(choose(self.compiled, None if iterations is None else self.iterations))
         else:
             self.solver = given
             self.named_iterations = iterations is not None
@@ -210,7 +211,9 @@ class Model(nn.Module):
     def check_iterations(self, changed: str | None) -> None:
         """Warn once if default iterations are too few after a change of `changed`; waits for a GPU until then."""
         if self._checked_time_steps != EVERY_STEP:
-            self._checked_time_steps = check_iterations(self.compiled, changed).checked_time_steps
+            now = self.compiled
+            self._checked_time_steps = EVERY_STEP  # also if the warning is raised as an error
+            self._checked_time_steps = check_iterations(now, changed).checked_time_steps
 
     @property
     def tolerance(self) -> float:
@@ -400,8 +403,6 @@ class Model(nn.Module):
         if guard is not self._rest_guard:
             self._rest_guard = guard
         return rest
-
-    numbers = Renamed("step_settings")
 
     def step_settings(self, *, inertial: bool, report: bool) -> dict[str, Any]:
         """The settings as keyword arguments of the ops."""
