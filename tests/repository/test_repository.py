@@ -15,6 +15,7 @@ from programs import ROOT
 from setuptools import find_packages
 
 import torchpd
+from torchpd.common.packages import OPTIONAL, REQUIRED
 
 PACKAGE_FILES = sorted((ROOT / "torchpd").rglob("*.py"))
 PLACEHOLDERS = re.compile(r"\b(" + "|".join(["TO" + "DO", "FIX" + "ME", "raise NotImplemented" + "Error"]) + r")\b")
@@ -106,6 +107,13 @@ def test_every_declared_dependency_is_pinned() -> None:
     wanted = [line for line in declared if "extra == 'tetwild'" not in line.replace('"', "'")]
     missing = requirement_names(wanted) - requirement_names(pinned("dev.txt")) - {"torchpd"}
     assert missing == set()
+
+
+def test_the_doctor_looks_for_every_declared_dependency() -> None:
+    declared = importlib.metadata.requires("torchpd") or []
+    ours = {package.pip_name for package in (*REQUIRED, *OPTIONAL)}
+    wanted = [line for line in declared if "extra == 'dev'" not in line.replace('"', "'")]
+    assert requirement_names(wanted) == ours
 
 
 @pytest.mark.parametrize("file", ["dev.txt", "lock.txt"])

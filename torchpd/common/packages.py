@@ -31,11 +31,13 @@ OPTIONAL = (
     Package("pyoidn", "pyoidn", "pictures without grain"),
     Package("matplotlib", "matplotlib", "plots"),
     Package("plotly", "plotly", "reports of studies"),
+    Package("jinja2", "jinja2", "reports of studies"),
     Package("threadpoolctl", "threadpoolctl", "times of studies"),
     Package("PIL", "pillow", "pictures"),
     Package("imageio_ffmpeg", "imageio-ffmpeg", "films"),
     Package("pygltflib", "pygltflib", "glTF files"),
     Package("pxr", "usd-core", "USD files"),
+    Package("rtree", "rtree", "fits to meshes"),
     Package("pytetwild", "pytetwild", 'tetrahedralize(method="tetwild")'),
 )
 

@@ -7,8 +7,8 @@ microseconds per tetrahedron with every kernel; a kernel adds its latency. Envir
 take turns.
 
 The numbers are rounded from Chebyshev steps on an H100, for meshes of 64 to 38,125 vertices
-(`benchmarks/kernels_by_batch.py`). In 218 batches the chosen kernel takes at most 1.02 times as long as the fastest.
-The times agree with the measurement within a third in float32 and within a factor 1.8 in float64. Only the order of the
+(`benchmarks/kernels_by_batch.py`). In 218 batches the chosen kernel takes at most 1.046 times as long as the fastest.
+The times agree with the measurement within 35 % in float32 and within a factor 1.8 in float64. Only the order of the
 kernels matters, so other GPUs need only have similar ratios.
 """
 
