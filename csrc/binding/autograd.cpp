@@ -98,6 +98,7 @@ variable_list keep(AutogradContext* context, const Tensor& positions, const Tens
   context->save_for_backward(std::move(saved));
   context->saved_data["time_step"] = rest.numbers.time_step;
   context->saved_data["thins"] = rest.every != 1;
+  context->saved_data["arrays"] = std::int64_t(material.size());
   *rest.info = info;
   return {after, after_velocities};
 }
@@ -108,13 +109,14 @@ struct SavedTensors {
   Tensor after, after_velocities;
   variable_list material, plan;
 
-  explicit SavedTensors(const variable_list& saved)
+  // `arrays`: those of the material
+  SavedTensors(const variable_list& saved, std::int64_t arrays)
       : positions(saved[0]),
         velocities(saved[1]),
         after(saved[3]),
         after_velocities(saved[4]),
-        material(saved.begin() + 5, saved.begin() + 5 + material_arrays),
-        plan(saved.begin() + 5 + material_arrays, saved.end()) {
+        material(saved.begin() + 5, saved.begin() + 5 + arrays),
+        plan(saved.begin() + 5 + arrays, saved.end()) {
     if (saved[2].defined()) forces = saved[2];
   }
 };
@@ -150,7 +152,8 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
   }
 
   static variable_list backward(AutogradContext* context, const variable_list& grads) {
-    const SavedTensors kept(context->get_saved_variables());
+    const SavedTensors kept(context->get_saved_variables(),
+                            context->saved_data["arrays"].toInt());
     const bool forces = kept.forces.has_value(), starts = context->saved_data["starts"].toBool();
     const std::size_t start_edge = forces ? 3 : 2;
     TORCH_CHECK(!starts || !context->needs_input_grad(start_edge),
@@ -189,7 +192,8 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
     TORCH_CHECK(!context->saved_data["thins"].toBool(),
                 "torchpd: the rollout op is differentiable with every=1 only, where it records "
                 "every state");
-    const SavedTensors kept(context->get_saved_variables());
+    const SavedTensors kept(context->get_saved_variables(),
+                            context->saved_data["arrays"].toInt());
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
     const variable_list values = call_rollout_vjp(

@@ -43,6 +43,8 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   };
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
+  const EffectArrays<T> effects(call.plan, t.material, call.batch, place);
+  call.effects = effects.view;
   call.inertia = of_vertices(a, "inertia", "N/m");
   call.inverse = of_vertices(inverse, "inverse", "of the diagonal [m/N], 0 for what is held");
   call.positions = x.const_data_ptr<T>();

@@ -125,6 +125,9 @@ class MaterialGradients {
 #define X(name, width, rows, meaning)    \
   if (place == place_in_material(#name)) \
     return reduce(name(), array, (width > 1 ? 1 : 0) + (std::string_view(#rows) != "one"));
+#define EFFECT(name, width, rows, meaning) \
+  if (place == place_in_material(#name))   \
+    return reduce(-of_effects()[place - material_arrays], array, width > 1 ? 2 : 1);
 #include "views/material.def"
 #undef X
     TORCH_INTERNAL_ASSERT(false);
@@ -165,6 +168,14 @@ class MaterialGradients {
     return -op.call(t_.after, multiplier_, unit, t_.plan);
   }
 
+  const std::vector<Tensor>& of_effects() const {
+    static const auto op =
+        find_op<std::vector<Tensor>(const Tensor&, const OptionalTensor&, at::TensorList,
+                                    at::TensorList)>("torchpd::effect_products");
+    if (!of_effects_) of_effects_ = op.call(t_.after, multiplier_, t_.material, t_.plan);
+    return *of_effects_;
+  }
+
   Tensor masses() const {
     const Tensor lag = 1 + material("damping").unsqueeze(-1).unsqueeze(-1) * h_;
     const Tensor pull = (lag * rate() - t_.velocities) / h_ - material("gravity").unsqueeze(-2);
@@ -202,6 +213,7 @@ class MaterialGradients {
   const LossMask& loss_mask_;
   double h_;
   mutable std::optional<std::tuple<Tensor, Tensor>> of_contacts_;
+  mutable std::optional<std::vector<Tensor>> of_effects_;
 };
 
 }  // namespace pd

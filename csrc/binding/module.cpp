@@ -2,6 +2,7 @@
 #include "binding/settings.h"
 #include "cpu/dispatch.h"
 #include "cuda/common/launch.h"
+#include "elements/kinds.h"
 #include "plan/cpu/build.h"
 #include "plan/gpu/build.h"
 #include "plan/multilevel/build.h"
@@ -41,10 +42,10 @@ py::array_t<T> as_array(std::vector<T>& numbers, py::ssize_t width) {
       owned->data(), owner);
 }
 
-void check_mesh(const Doubles& positions, const Indices& tets) {
+void check_mesh(const Doubles& positions, const Indices& tets, bool others = false) {
   if (positions.ndim() != 2 || positions.shape(1) != 3)
     throw py::value_error("positions must be float64 [vertices, 3]");
-  if (tets.ndim() != 2 || tets.shape(1) != 4 || tets.shape(0) == 0)
+  if (tets.ndim() != 2 || tets.shape(1) != 4 || (tets.shape(0) == 0 && !others))
     throw py::value_error("tets must be int64 [count > 0, 4]");
   const std::int64_t count = positions.shape(0), *t = tets.data();
   // slots, up to four a tetrahedron, are counted in 32 bits
@@ -61,17 +62,84 @@ void check_mesh(const Doubles& positions, const Indices& tets) {
   }
 }
 
-py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_size,
+// The shape of a kind of stencils, see elements/stencil.h.
+struct KindShape {
+  const char* name;
+  int corners, dims, constants, numbers;
+  std::vector<std::string> rows;
+  const char* meaning;
+};
+
+std::vector<KindShape> kind_shapes() {
+  std::vector<KindShape> kinds;
+#define KIND(name, type, what)                                                        \
+  kinds.push_back({#name, pd::type::corners, pd::type::dims, pd::type::constants,    \
+                   pd::type::numbers, {}, what});
+#define PARAMETER(name, array) kinds.back().rows.push_back(#array);
+#include "elements/kinds.def"
+#undef KIND
+  return kinds;
+}
+
+// Stencils of one kind as Python gives them: kind, corners, g_a, V, constants.
+using Stencils = std::tuple<int, Indices, Doubles, Doubles, Doubles>;
+
+pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices) {
+  const auto& [kind, corner, gradient, measure, constant] = given;
+  const std::vector<KindShape> shapes = kind_shapes();
+  if (kind < 0 || kind >= std::ssize(shapes))
+    throw py::value_error("the kind of stencils must be a row of kind_table");
+  const KindShape& shape = shapes[kind];
+  const py::ssize_t count = corner.ndim() == 2 ? corner.shape(0) : -1;
+  const bool fits = count >= 0 && corner.shape(1) == shape.corners && gradient.ndim() == 3 &&
+                    gradient.shape(0) == count && gradient.shape(1) == shape.corners &&
+                    gradient.shape(2) == shape.dims && measure.ndim() == 1 &&
+                    measure.shape(0) == count && constant.ndim() == 2 &&
+                    constant.shape(0) == count && constant.shape(1) == shape.constants;
+  if (!fits)
+    throw py::value_error(std::string(shape.name) + ": corners must be int64 [count, " +
+                          std::to_string(shape.corners) + "], gradients float64 [count, " +
+                          std::to_string(shape.corners) + ", " + std::to_string(shape.dims) +
+                          "], measure [count] and constants [count, " +
+                          std::to_string(shape.constants) + "]");
+  for (py::ssize_t i = 0; i < corner.size(); ++i) {
+    if (corner.data()[i] < 0 || corner.data()[i] >= vertices)
+      throw py::index_error(std::string(shape.name) +
+                            ": corners refer to vertices that positions does not have");
+  }
+  return {kind,           shape.corners,   shape.dims,     shape.constants,
+          shape.numbers,  count,           corner.data(),  gradient.data(),
+          measure.data(), constant.data()};
+}
+
+// Number of stencils of each kind, after the counts of StencilSize.
+std::vector<std::int32_t> stencil_sizes(const pd::MeshPlan& plan, const pd::MeshElements& elements,
+                                        int lanes) {
+  std::vector<std::int32_t> sizes(pd::stencil_size_count + int(pd::KindNumber::count));
+  sizes[pd::stencil_blocks] = std::int32_t(plan.stencil_block.size() / 4);
+  sizes[pd::stencil_corner_rows] = std::int32_t(plan.stencil_corner.size() / lanes);
+  sizes[pd::stencil_stored_rows] = std::int32_t(plan.stencil_stored.size() / lanes);
+  sizes[pd::stencil_number_rows] = plan.stencil_numbers;
+  for (const pd::StencilGroup& group : elements.groups)
+    sizes[pd::stencil_size_count + group.kind] = std::int32_t(group.count);
+  return sizes;
+}
+
+py::dict build_plan(const Doubles& positions, const Indices& tets,
+                    const std::vector<Stencils>& stencils, int patch_size,
                     const std::function<void(double)>& progress) {
-  check_mesh(positions, tets);
-  if (patch_size < 16 || patch_size > 8192)
-    throw py::value_error("patch_size must lie in 16..8192");
-  auto plan = pd::build_plan(positions.data(), positions.shape(0), tets.data(), tets.shape(0),
-                             patch_size, progress);
+  check_mesh(positions, tets, !stencils.empty());
+  if (patch_size < 16 || patch_size > 4096)
+    throw py::value_error("patch_size must lie in 16..4096");
+  pd::MeshElements elements{positions.data(), positions.shape(0), tets.data(), tets.shape(0)};
+  for (const Stencils& group : stencils)
+    elements.groups.push_back(stencil_group(group, positions.shape(0)));
+  auto plan = pd::build_plan(elements, patch_size, progress);
   py::dict arrays;
   std::map<std::string, int> widths;
 #define X(name, type, width, rows, meaning) widths[#name] = width;
 #include "views/cpu_plan.def"
+#include "views/cpu_stencils.def"
 #undef X
   const auto add = [&](const char* name, auto& numbers) {
     arrays[name] = as_array(numbers, widths.at(name));
@@ -88,6 +156,16 @@ py::dict build_plan(const Doubles& positions, const Indices& tets, int patch_siz
   add("slot_vertex", plan.slot_vertex);
   add("shared_start", plan.shared_start);
   add("shared_slot", plan.shared_slot);
+  if (stencils.empty()) return arrays;
+  auto sizes = stencil_sizes(plan, elements, widths.at("stencil_order"));
+  add("stencil_sizes", sizes);
+  add("stencil_block", plan.stencil_block);
+  add("patch_stencil", plan.patch_stencil);
+  add("stencil_order", plan.stencil_order);
+  add("stencil_measure", plan.stencil_measure);
+  add("stencil_bound", plan.stencil_bound);
+  add("stencil_corner", plan.stencil_corner);
+  add("stencil_stored", plan.stencil_stored);
   return arrays;
 }
 
@@ -167,6 +245,9 @@ struct TableRow {
 constexpr TableRow plan_rows[] = {
 #include "views/cpu_plan.def"
 };
+constexpr TableRow stencil_rows[] = {
+#include "views/cpu_stencils.def"
+};
 constexpr TableRow multilevel_rows[] = {
 #include "views/multilevel.def"
 };
@@ -184,7 +265,10 @@ py::list table(std::span<const TableRow> rows) {
 
 py::list material_table() {
   py::list rows;
-#define X(name, width, rows_, meaning) rows.append(py::make_tuple(#name, width, #rows_, meaning));
+#define X(name, width, rows_, meaning) \
+  rows.append(py::make_tuple(#name, width, #rows_, meaning, false));
+#define EFFECT(name, width, rows_, meaning) \
+  rows.append(py::make_tuple(#name, width, #rows_, meaning, true));
 #include "views/material.def"
 #undef X
   return rows;
@@ -207,6 +291,14 @@ py::list settings_table() {
   rows.append(py::make_tuple(#name, schema_type<type>, Given<type>(usual), contract, meaning));
 #include "views/settings.def"
 #undef X
+  return rows;
+}
+
+py::list kind_table() {
+  py::list rows;
+  for (const KindShape& kind : kind_shapes())
+    rows.append(py::make_tuple(kind.name, kind.corners, kind.dims, kind.constants,
+                               py::tuple(py::cast(kind.rows)), kind.meaning));
   return rows;
 }
 
@@ -298,8 +390,8 @@ PYBIND11_MODULE(_C, m) {
   main_thread =
       py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
   pd::Interrupt::set_check(&run_signal_handlers);
-  m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("patch_size"),
-        py::arg("progress"));
+  m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("stencils"),
+        py::arg("patch_size"), py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
         py::arg("patches"), py::arg("kernel"), py::arg("fixed"), py::arg("piece"),
         py::arg("progress"));
@@ -310,6 +402,11 @@ PYBIND11_MODULE(_C, m) {
       "plan_table", [] { return table(plan_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");
   m.def(
+      "stencil_table", [] { return table(stencil_rows); },
+      "Rows (name, type, width, rows, meaning) of the constant arrays of stencils, in op order.");
+  m.def("kind_table", &kind_table,
+        "Rows (name, corners, dims, constants, arrays, meaning) of the kinds of stencils.");
+  m.def(
       "multilevel_table", [] { return table(multilevel_rows); },
       "Rows (name, type, width, rows, meaning) of a preconditioner's arrays, in op order.");
   m.def(
@@ -317,7 +414,7 @@ PYBIND11_MODULE(_C, m) {
       "Rows (name, type, width, rows, meaning) of the constant arrays on a GPU, in op order.");
   m.def("device_sizes", &device_sizes, "Names of the numbers in a GPU plan's sizes.");
   m.def("material_table", &material_table,
-        "Rows (name, width, rows, meaning) of the differentiable arrays, in op order.");
+        "Rows (name, width, rows, meaning, effect) of the differentiable arrays, in op order.");
   m.def("material_columns", &material_columns,
         "Rows (array, name, first, width, meaning) of the columns that those arrays have.");
   m.def("settings_table", &settings_table,

@@ -127,6 +127,10 @@ TORCH_LIBRARY(torchpd, m) {
       "element_energy_product(Tensor positions, Tensor direction, Tensor[] material, Tensor[] "
       "plan) "
       "-> Tensor");
+  with_plan("effect_energy(Tensor positions, Tensor[] material, Tensor[] plan) -> Tensor");
+  with_plan(
+      "effect_products(Tensor positions, Tensor? direction, Tensor[] material, Tensor[] plan) -> "
+      "Tensor[]");
   with_plan("elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted) -> Tensor");
   with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
   with_plan(

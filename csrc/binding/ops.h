@@ -39,7 +39,7 @@ void step_typed(const StepTensors& t, const Settings& settings) {
   check_vertices(t.positions, call.plan.vertices);
   check_levels(call.plan, settings.multilevel());
   call.material =
-      material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
+      material_view<T>(call.plan, t.material, call.batch, place);
   check_tets(t.material[0], call.plan.tets);
   call.settings = settings;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
@@ -145,7 +145,7 @@ Outputs rollout(const Numbers& n, const Tensor& positions, const Tensor& velocit
 template <class Backend, class T>
 void field_typed(Field field, const Tensor& positions, const Tensor& direction,
                  at::TensorList material, at::TensorList plan, const Tensor& out,
-                 const Tensor& displacement = {}) {
+                 const Tensor& displacement = {}, const std::vector<Tensor>& products = {}) {
   FieldCall<T, typename Backend::template Plan<T>> call;
   const Place place{positions.device()};
   call.plan = Backend::template plan_view<T>(plan, place);
@@ -156,6 +156,11 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
   const Tensor d = direction.defined() ? direction.contiguous() : Tensor();
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
+  const EffectArrays<T> effects(call.plan, material, call.batch, place);
+  call.effects = effects.view;
+  for (std::size_t i = 0; i < products.size(); ++i) {
+    if (products[i].numel() > 0) call.products[i] = products[i].template mutable_data_ptr<T>();
+  }
   call.positions = x.const_data_ptr<T>();
   call.direction = d.defined() ? d.const_data_ptr<T>() : nullptr;
   call.displacement = displacement.defined() ? displacement.const_data_ptr<T>() : nullptr;
@@ -181,6 +186,43 @@ Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
     field_typed<Backend, double>(field, positions, direction, material, plan, out);
   }
   return out;
+}
+
+// Energy of the stencils of every environment [batch].
+template <class Backend>
+Tensor effect_energy(const Tensor& positions, at::TensorList material, at::TensorList plan) {
+  check_positions(positions, "positions");
+  const Tensor out = at::zeros({positions.size(0)}, positions.options());
+  if (positions.scalar_type() == at::kFloat) {
+    field_typed<Backend, float>(Field::effect_energy, positions, {}, material, plan, out);
+  } else {
+    field_typed<Backend, double>(Field::effect_energy, positions, {}, material, plan, out);
+  }
+  return out;
+}
+
+// Derivatives by each array of the effects, [batch, rows]: of the gradient's product with a direction, or else of the
+// energy.
+template <class Backend>
+std::vector<Tensor> effect_products(const Tensor& positions, const OptionalTensor& direction,
+                                    at::TensorList material, at::TensorList plan) {
+  check_positions(positions, "positions");
+  check_material_size(material);
+  if (direction) check_state(*direction, positions, "direction", "m");
+  const Tensor along = direction ? *direction : Tensor();
+  std::vector<Tensor> products;
+  for (std::size_t i = material_arrays; i < material.size(); ++i) {
+    products.push_back(
+        at::zeros({positions.size(0), material[i].size(-1)}, positions.options()));
+  }
+  const Tensor out = at::empty({0}, positions.options());
+  const Field field = Field::effect_products;
+  if (positions.scalar_type() == at::kFloat) {
+    field_typed<Backend, float>(field, positions, along, material, plan, out, {}, products);
+  } else {
+    field_typed<Backend, double>(field, positions, along, material, plan, out, {}, products);
+  }
+  return products;
 }
 
 template <class Backend>
@@ -214,8 +256,11 @@ Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighte
   call.field = Field::diagonal;
   call.weighted = weighted;
   const Tensor w = stiffness_of(material, call.plan.tets);
-  const bool batched = w.dim() == 2;
-  call.batch = batched ? w.size(0) : 1;
+  const std::int64_t own = environments_of(material);
+  const bool batched = own > 0;
+  call.batch = batched ? own : 1;
+  const EffectArrays<T> effects(call.plan, material, call.batch, place);
+  call.effects = effects.view;
   const Tensor out = batched ? at::empty({call.batch, call.plan.vertices}, w.options())
                              : at::empty({call.plan.vertices}, w.options());
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
@@ -304,6 +349,8 @@ void register_ops(torch::Library& m) {
   m.impl("hessian_product", &hessian_product<Backend>);
   m.impl("element_energy", &element_energy<Backend>);
   m.impl("element_energy_product", &element_energy_product<Backend>);
+  m.impl("effect_energy", &effect_energy<Backend>);
+  m.impl("effect_products", &effect_products<Backend>);
   m.impl("elastic_diagonal", &elastic_diagonal<Backend>);
   m.impl("precondition", &precondition<Backend>);
   m.impl("conjugate_gradients_", &conjugate_gradients_inplace<Backend>);

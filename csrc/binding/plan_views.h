@@ -1,12 +1,14 @@
 // Tensors to views: the arrays of a plan and of a material, and their lengths.
 #pragma once
 #include "binding/checks.h"
+#include "elements/kinds.h"
 #include "views/shared_memory.h"
 #include "views/views.h"
 
 #include <ATen/ATen.h>
 #include <c10/util/Exception.h>
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <string>
@@ -53,6 +55,38 @@ struct LevelRows {
       middle_node_end, coarse_entry, device_coarse_entry;
 };
 
+#define X(name, type, width, rows, meaning) +1
+constexpr int stencil_arrays = 0
+#include "views/cpu_stencils.def"
+    ;
+#undef X
+static_assert(stencil_arrays != level_arrays);  // the number of arrays tells what follows
+
+// Lengths of the arrays, by the names in cpu_stencils.def.
+struct StencilRows {
+  std::int64_t stencil_size, stencil_block, patch_end, stencil_corner_row, stencil_stored_row;
+};
+
+// The arrays of the stencils, which begin at `first`.
+template <class T>
+void view_stencils(Plan<T>& plan, at::TensorList arrays, int first, const Place& place) {
+  constexpr int sizes = stencil_size_count + int(KindNumber::count);
+  check_array(arrays[first], at::kInt, sizes, 1, {at::kCPU, "every plan's sizes"},
+              "plan.stencil_sizes", "counts");
+  const int32* size = arrays[first].const_data_ptr<int32>();
+  plan.stencil_blocks = size[stencil_blocks];
+  plan.stencil_numbers = size[stencil_number_rows];
+  const StencilRows count{sizes, plan.stencil_blocks, plan.patches + 1, size[stencil_corner_rows],
+                          size[stencil_stored_rows]};
+  int at = first;
+  using real = T;
+#define X(name, type, width, rows, meaning)                                                     \
+  check_array(arrays[at], scalar_type<type>, count.rows, width, place, "plan." #name, meaning); \
+  plan.name = arrays[at++].const_data_ptr<type>();
+#include "views/cpu_stencils.def"
+#undef X
+}
+
 // The preconditioner's arrays, which begin at `first`.
 template <class T>
 Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
@@ -98,10 +132,13 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
 // Lengths of the arrays are checked; their contents are trusted.
 template <class T>
 Plan<T> plan_view(at::TensorList arrays, const Place& place) {
-  constexpr int with_levels = plan_arrays + level_arrays;
-  TORCH_CHECK_VALUE(arrays.size() == plan_arrays || arrays.size() == with_levels,
-                    "plan must be the ", plan_arrays, " arrays of Plan.arrays, or ", with_levels,
-                    " with those of a multilevel preconditioner, got ", arrays.size());
+  const int others = int(arrays.size()) - plan_arrays;
+  const bool stencils = others == stencil_arrays || others == stencil_arrays + level_arrays;
+  const int levels_at = plan_arrays + (stencils ? stencil_arrays : 0);
+  const bool levels = int(arrays.size()) == levels_at + level_arrays;
+  TORCH_CHECK_VALUE(levels || int(arrays.size()) == levels_at, "plan must be the ", plan_arrays,
+                    " arrays of Plan.arrays, ", stencil_arrays, " more with stencils, and ",
+                    level_arrays, " more with a multilevel preconditioner, got ", arrays.size());
   const int32* size = sizes_view(arrays[0], plan_size_count);
   Plan<T> plan;
   plan.vertices = size[plan_vertices];
@@ -136,8 +173,8 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.name = arrays[at++].const_data_ptr<type>();
 #include "views/cpu_plan.def"
 #undef X
-  if (arrays.size() == with_levels)
-    plan.levels = levels_view<T>(arrays, plan_arrays, plan.vertices, plan.tets, place);
+  if (stencils) view_stencils(plan, arrays, plan_arrays, place);
+  if (levels) plan.levels = levels_view<T>(arrays, levels_at, plan.vertices, plan.tets, place);
   return plan;
 }
 
@@ -270,10 +307,26 @@ constexpr int material_arrays = 0
     ;
 #undef X
 
+// Arrays of a material with those that only some scenes have.
+#define X(name, width, rows, meaning) +1
+#define EFFECT X
+constexpr int all_material_arrays = 0
+#include "views/material.def"
+    ;
+#undef X
+
+inline void check_material_size(at::TensorList material) {
+  TORCH_CHECK_VALUE(
+      material.size() == material_arrays || material.size() == all_material_arrays,
+      "material must be ", material_arrays, " arrays, or ", all_material_arrays,
+      " with those that only some scenes have, got ", material.size());
+}
+
 // The place of an array in a material.
 constexpr std::size_t place_in_material(std::string_view name) {
   constexpr std::string_view names[] = {
 #define X(name, width, rows, meaning) #name,
+#define EFFECT X
 #include "views/material.def"
 #undef X
   };
@@ -284,8 +337,7 @@ constexpr std::size_t place_in_material(std::string_view name) {
 
 // The array of a name.
 inline const Tensor& array_of(at::TensorList material, std::string_view name) {
-  TORCH_CHECK_VALUE(material.size() == material_arrays, "material must be ", material_arrays,
-                    " arrays, got ", material.size());
+  check_material_size(material);
   return material[place_in_material(name)];
 }
 
@@ -294,6 +346,14 @@ inline Tensor stiffness_of(at::TensorList material, std::int64_t tets) {
   const Tensor& stiffness = array_of(material, "stiffness");
   check_tets(stiffness, tets);
   return stiffness.contiguous();
+}
+
+inline void check_effect(at::TensorList material, std::string_view name, const char* kind,
+                         std::int64_t count) {
+  const Tensor& array = material[place_in_material(name)];
+  TORCH_CHECK_VALUE(array.dim() >= 1 && array.size(-1) == count, "material.", name,
+                    " must have a row for each of the ", count, " stencils of kind ", kind,
+                    " in the plan, got ", describe(array));
 }
 
 // Columns, where an array has any, are all of its numbers.
@@ -317,15 +377,81 @@ inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
   return t.size(width > 1 ? -2 : -1);
 }
 
+// Every stencil needs its row of each array that its kind reads.
 template <class T>
-Material<T> material_view(at::TensorList arrays, std::int64_t vertices, std::int64_t pins,
-                          std::int64_t batch, const Place& place) {
-  TORCH_CHECK_VALUE(arrays.size() == material_arrays, "material must be ", material_arrays,
-                    " arrays, got ", arrays.size());
+void check_effects(const Plan<T>& plan, at::TensorList material) {
+  if (plan.stencil_blocks == 0) return;
+  TORCH_CHECK_VALUE(material.size() == all_material_arrays, "material must be ",
+                    all_material_arrays, " arrays for a plan with stencils, got ",
+                    material.size());
+#define KIND(kind, type, what)
+#define PARAMETER(kind, array)                                                                  \
+  check_effect(material, #array, #kind,                                                         \
+               plan.stencil_sizes[stencil_size_count + int(KindNumber::kind)]);
+#include "elements/kinds.def"
+#undef KIND
+}
+template <class T>
+void check_effects(const DevicePlan<T>&, at::TensorList) {}
+
+// The arrays that only some scenes have.
+template <class P, class T>
+Effects<T> effects_view(const P& plan, at::TensorList arrays, std::int64_t batch,
+                        const Place& place) {
+  Effects<T> effects;
+  check_effects(plan, arrays);
+  if (arrays.size() == material_arrays) return effects;
+  int at = material_arrays;
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning)                                                     \
+  if (const std::int64_t count = rows_of(arrays[at], width, #name); count > 0)                 \
+    effects.name =                                                                             \
+        values_view<T>(arrays[at], count, width, false, batch, place, #name, meaning);         \
+  ++at;
+#include "views/material.def"
+#undef X
+  return effects;
+}
+
+// Those arrays made contiguous, and their view.
+template <class T>
+struct EffectArrays {
+  std::vector<Tensor> kept;
+  Effects<T> view;
+
+  template <class P>
+  EffectArrays(const P& plan, at::TensorList material, std::int64_t batch, const Place& place) {
+    if (material.size() > material_arrays) {
+      for (const Tensor& array : material) kept.push_back(array.contiguous());
+      view = effects_view<P, T>(plan, kept, batch, place);
+    } else {
+      check_effects(plan, material);
+    }
+  }
+};
+
+// Environments of the elastic material; 0 where all share it.
+inline std::int64_t environments_of(at::TensorList material) {
+  std::int64_t own = array_of(material, "stiffness").dim() == 2 ? material[0].size(0) : 0;
+  std::size_t at = material_arrays;
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning)                                                     \
+  if (at < material.size() && material[at].dim() == (width > 1 ? 3 : 2))                       \
+    own = std::max(own, material[at].size(0));                                                 \
+  ++at;
+#include "views/material.def"
+#undef X
+  return own;
+}
+
+template <class T, class P>
+Material<T> material_view(const P& plan, at::TensorList arrays, std::int64_t batch,
+                          const Place& place) {
+  check_material_size(arrays);
   Material<T> material;
   Rows count{};
-  count.vertex = vertices;
-  count.pin = pins;
+  count.vertex = plan.vertices;
+  count.pin = plan.pins;
   int at = 0;
 #define X(name, width, rows, meaning)                                                          \
   if (std::string(#rows) == "tet") count.tet = rows_of(arrays[at], width, #name);              \
@@ -337,6 +463,7 @@ Material<T> material_view(at::TensorList arrays, std::int64_t vertices, std::int
 #undef X
   material.planes_count = int(count.plane);
   material.spheres_count = int(count.sphere);
+  material.effects = effects_view<P, T>(plan, arrays, batch, place);
   return material;
 }
 

@@ -58,8 +58,7 @@ std::vector<Tensor> rollout_vjp(const Tensor& grad_positions, const Tensor& grad
   check_track(grad_positions, positions, after, "grad_positions", "of a loss, 1/m");
   check_track(grad_velocities, positions, after, "grad_velocities", "of a loss, 1/(m/s)");
   CheckSetting::time_step(time_step);
-  TORCH_CHECK_VALUE(material.size() == material_arrays, "rollout_vjp: material must have ",
-                    material_arrays, " arrays, got ", material.size());
+  check_material_size(material);
   check_wanted(wanted, material.size(), "rollout_vjp");
   const std::size_t spheres = place_in_material("spheres");
   const auto wants = [&](std::size_t i) { return !wanted || wanted->get(i); };

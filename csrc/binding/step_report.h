@@ -13,7 +13,7 @@ void report_typed(const StepTensors& t, const Numbers& n) {
   call.batch = t.positions.size(0);
   if (call.batch == 0) return;
   call.material =
-      material_view<T>(t.material, call.plan.vertices, call.plan.pins, call.batch, place);
+      material_view<T>(call.plan, t.material, call.batch, place);
   call.time_step = n.time_step;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
   const Tensor f = t.forces ? t.forces->contiguous() : Tensor();

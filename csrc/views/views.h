@@ -64,15 +64,26 @@ Levels<T> count_levels(const int32* sizes, int vertices) {
   return levels;
 }
 
+// Entries of a plan's array of sizes of stencils; then the number of stencils of each kind.
+enum StencilSize : int {
+  stencil_blocks,
+  stencil_corner_rows,
+  stencil_stored_rows,
+  stencil_number_rows,
+  stencil_size_count
+};
+
 template <class T>
 struct Plan {
   using real = T;
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/cpu_plan.def"
+#include "views/cpu_stencils.def"
 #undef X
   int vertices = 0, tets = 0, pins = 0, components = 0, blocks = 0, patches = 0, slots = 0,
       shared = 0;
   int most_slots = 0;  // of any patch
+  int stencil_blocks = 0, stencil_numbers = 0;  // blocks of 16 stencils; rows of 16 numbers of a step
   Levels<T> levels;
 };
 
@@ -116,6 +127,7 @@ constexpr std::int64_t most_blocks = (std::int64_t(1) << 32) / (5 * 32);
 // Numbers in a row of each array of the material.
 enum MaterialWidth : int {
 #define X(name, width, rows, meaning) name##_numbers = width,
+#define EFFECT X
 #include "views/material.def"
 #undef X
 };
@@ -138,12 +150,30 @@ struct Values {
   PD_HD const T* of(std::int64_t environment) const { return data + environment * stride; }
 };
 
+// The arrays that only some scenes have; data is null where a scene lacks them.
+template <class T>
+struct Effects {
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning) Values<T> name;
+#include "views/material.def"
+#undef X
+};
+
+enum EffectNumber : int {
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning) effect_##name,
+#include "views/material.def"
+#undef X
+  effect_count
+};
+
 template <class T>
 struct Material {
 #define X(name, width, rows, meaning) Values<T> name;
 #include "views/material.def"
 #undef X
   int planes_count = 0, spheres_count = 0;
+  Effects<T> effects;
 };
 
 // from lbfgs on, the solver is multilevel
@@ -207,7 +237,9 @@ enum class Field : int {
   element_energy,
   element_energy_product,
   diagonal,
-  report  // see SolidReport
+  report,  // see SolidReport
+  effect_energy,  // energy of all stencils
+  effect_products  // derivatives by the arrays of the effects
 };
 
 template <class T, class P = Plan<T>>
@@ -215,6 +247,7 @@ struct FieldCall {
   P plan;
   Field field = Field::gradient;
   Values<T> stiffness;
+  Effects<T> effects;
   std::int64_t batch = 0;
   bool weighted = false;         // weighted by l_e; for the diagonal
   const T* positions = nullptr;  // [batch, vertices, 3], for all but the diagonal
@@ -223,6 +256,8 @@ struct FieldCall {
   const T* direction = nullptr;  // [batch, vertices, 3], for the products
   T* out =
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
+  // effect_products: for each array of the effects [batch, rows], null if not wanted
+  T* products[effect_count] = {};
 };
 
 // Sums over the vertices of an environment for a report, see solver/report.h.
@@ -355,6 +390,7 @@ template <class T, class P = Plan<T>>
 struct ConjugateCall {
   P plan;
   Values<T> stiffness;
+  Effects<T> effects;
   Values<T> inertia, inverse;  // [vertices]; inverse diagonal, 0 where a vertex does not move
   std::int64_t batch = 0;
   const T* positions = nullptr;  // [batch, vertices, 3]

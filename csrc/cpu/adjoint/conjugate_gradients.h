@@ -139,10 +139,9 @@ class ConjugatePass {
       w_.inertia[i] = call_.inertia.of(environment_)[plan_.vertex_order[i]];
       w_.inverse[i] = call_.inverse.of(environment_)[plan_.vertex_order[i]];
     }
-    const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
-    for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
-      w_.weight[e] = plan_.tet_volume[e] * call_.stiffness.of(environment_)[plan_.tet_order[e]];
-    }
+    const auto environment_of = [&](int) { return environment_; };
+    sweep_.set_weights(call_.stiffness, false, environment_of);
+    sweep_.set_stencil_numbers(call_.effects, environment_of);
     team_.barrier();
     sweep_.set_origins();
     team_.barrier();
@@ -153,7 +152,7 @@ class ConjugatePass {
       jacobians_.set(elements.part(s),
                      RotationJacobian<R>(deformation_gradient(x, elements.rest(s))));
     });
-    sweep_.run(0, differentiate, [](std::int64_t, const Quad<T>&, Sum&) {});
+    sweep_.run(0, Elements{differentiate, NoStencils{}}, [](std::int64_t, const Quad<T>&, Sum&) {});
   }
 
   void begin(Conjugate& numbers) {
@@ -182,7 +181,7 @@ class ConjugatePass {
                             elements.weight(s), g);
       elements.add(s, g);
     });
-    sweep_.template run<2>(0, product, visit);
+    sweep_.template run<2>(0, Elements{product, StencilHessian{}}, visit);
   }
 
   void iterate(Conjugate& numbers) {

@@ -22,13 +22,18 @@ class FieldPass {
   void run(std::int64_t environment) {
     load(environment);
     if (call_.field == Field::gradient) {
-      vertex_field<1, 3>(environment, SolidGradient<false>{});
+      vertex_field<1, 3>(environment, elastic_gradient<false>());
     } else if (call_.field == Field::diagonal) {
-      vertex_field<1, 1>(environment, SolidDiagonal{});
+      vertex_field<1, 1>(environment,
+                         Elements{SolidDiagonal{}, StencilDiagonal{call_.weighted}});
     } else if (call_.field == Field::report) {
-      vertex_field<1, 3>(environment, SolidReport{});
+      vertex_field<1, 3>(environment, Elements{SolidReport{}, StencilReport{}});
     } else if (call_.field == Field::hessian_product) {
-      vertex_field<2, 3>(environment, SolidHessian{});
+      vertex_field<2, 3>(environment, Elements{SolidHessian{}, StencilHessian{}});
+    } else if (call_.field == Field::effect_energy) {
+      sum_energy(environment);
+    } else if (call_.field == Field::effect_products) {
+      differentiate_by_effects(environment);
     } else if (call_.field == Field::element_energy) {
       element_field<1>(environment, [](const auto& x, const auto& rest, const auto& weight) {
         using R = std::remove_cvref_t<decltype(weight)>;
@@ -56,11 +61,9 @@ class FieldPass {
       if (call_.displacement) w_.u[i] = read(call_.displacement, environment, i);
       if (call_.direction) w_.before[i] = read(call_.direction, environment, i);
     }
-    const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
-    for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
-      const T volume = plan_.tet_volume[e] * (call_.weighted ? plan_.tet_bound[e] : T(1));
-      w_.weight[e] = volume * call_.stiffness.of(environment)[plan_.tet_order[e]];
-    }
+    const auto environment_of = [&](int) { return environment; };
+    sweep_.set_weights(call_.stiffness, call_.weighted, environment_of);
+    sweep_.set_stencil_numbers(call_.effects, environment_of);
     team_.barrier();
     sweep_.set_origins();
     team_.barrier();
@@ -72,6 +75,54 @@ class FieldPass {
       T* to = call_.out + (environment * plan_.vertices + plan_.vertex_order[i]) * Components;
       for (int c = 0; c < Components; ++c) to[c] = force.q.v[c];
     });
+  }
+
+  void sum_energy(std::int64_t environment) {
+    const auto none = one_by_one([](const auto&, int) {});
+    sweep_.run(0, Elements{none, StencilGradient<true>{}},
+               [](std::int64_t, const Quad<T>&, Sum&) {});
+    if (team_.rank != 0) return;
+    double sum = 0;
+    for (int part = 0; part < w_.part_count; ++part) sum += w_.parts[0][part].energy;
+    call_.out[environment] = T(sum);
+  }
+
+  // Each stencil writes to its own row.
+  void differentiate_by_effects(std::int64_t environment) {
+    for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
+      call_.direction ? sweep_.template gather_slots<2>(patch)
+                      : sweep_.template gather_slots<1>(patch);
+      each_stencil<Batch<T, 1>>(plan_, patch, [&](auto kind, const StencilPart<T>& part) {
+        using Kind = decltype(kind);
+        if (plan_.stencil_measure[part.stencil()] != T(0))
+          write_products<Kind>(environment, part);
+      });
+    }
+  }
+
+  template <class Kind>
+  void write_products(std::int64_t environment, const StencilPart<T>& part) {
+    constexpr EffectsOf<Kind> effects;
+    const int number = plan_.stencil_order[part.stencil()];
+    const MaterialRows<Kind, T> rows(call_.effects, environment);
+    T g[gradient_numbers<Kind>], c[constant_slots<Kind>] = {}, row[Kind::rows];
+    for (int i = 0; i < gradient_numbers<Kind>; ++i) g[i] = *part.stored(i);
+    for (int i = 0; i < Kind::constants; ++i) c[i] = *part.stored(gradient_numbers<Kind> + i);
+    for (int i = 0; i < Kind::rows; ++i) row[i] = rows.row[i][number];
+    Vec3<T> x[Kind::corners], f[Kind::dims], df[Kind::dims] = {};
+    for (int a = 0; a < Kind::corners; ++a) x[a] = to_vec3(scratch_.x[*part.corner(a)]);
+    deform<Kind>(x, g, f);
+    if (call_.direction) {
+      for (int a = 0; a < Kind::corners; ++a) x[a] = to_vec3(scratch_.direction[*part.corner(a)]);
+      deform<Kind>(x, g, df);
+    }
+    const std::int64_t count = plan_.stencil_sizes[stencil_size_count + kind_number<Kind>];
+    for (int i = 0; i < Kind::rows; ++i) {
+      T* out = call_.products[effects.effect[i]];
+      if (!out) continue;
+      const RowDerivative<Kind, T> by(i, row, plan_.stencil_measure[part.stencil()], f, df, c);
+      out[environment * count + number] = call_.direction ? by.product : by.energy;
+    }
   }
 
   template <int Fields, class Element>

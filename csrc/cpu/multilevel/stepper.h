@@ -67,7 +67,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
 
   // E and the residual at the trial u
   void evaluate(int k) {
-    sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
+    sweep_.run(k & 1, elastic_gradient<true>(), [&](std::int64_t i, const Value& force, Sum& sums) {
       const auto v = vertex(i);
       sums.energy = v.add_energy(w_.u[i], sums.energy);
       o_.trial_residual[i] = v.residual(contacts_, w_.u[i], force);

@@ -119,12 +119,12 @@ class Stepper {
     }
     const bool guard = schedule_[0].checks_energy(k);
     if (guard) {
-      sweep_.run(k & 1, SolidGradient<true>{}, [&](std::int64_t i, const Value& force, Sum& sums) {
+      sweep_.run(k & 1, elastic_gradient<true>(), [&](std::int64_t i, const Value& force, Sum& sums) {
         sums.energy = vertex(i).add_energy(w_.u[i], sums.energy);
         update(i, force, sums);
       });
     } else {
-      sweep_.run(k & 1, SolidGradient<false>{},
+      sweep_.run(k & 1, elastic_gradient<false>(),
                  [&](std::int64_t i, const Value& force, Sum& sums) { update(i, force, sums); });
     }
     conclude(k, guard);
@@ -201,7 +201,7 @@ class Stepper {
     if (contacts_.sphere_count) team_.barrier();
   }
 
-  // a and 1 / D of every vertex, w V of every element, and the smallest a / D
+  // a and 1 / D of every vertex, the weights of every element, and the smallest a / D
   void assemble_diagonal() {
     const Real none(T(0));
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
@@ -213,9 +213,12 @@ class Stepper {
       in_.each_pin([&](std::int64_t i, Real spring, Value) {
         w_.inertia[i] = held_inertia(w_.inertia[i] + spring, spring);
       });
-    set_weights(set_.weighted);
+    const auto environment_of = [&](int lane) { return in_.environment(lane); };
+    sweep_.set_weights(call_.material.stiffness, set_.weighted, environment_of);
+    sweep_.set_stencil_numbers(call_.material.effects, environment_of);
     team_.barrier();
-    sweep_.run(0, SolidDiagonal{}, [&](std::int64_t i, const Value& force, Sum& sums) {
+    const Elements<SolidDiagonal, StencilDiagonal> diagonal{{}, {set_.weighted}};
+    sweep_.run(0, diagonal, [&](std::int64_t i, const Value& force, Sum& sums) {
       const Real a = w_.inertia[i];
       const Real elastic = Lanes::vec3(force).x;
       w_.inverse[i] = inverse_diagonal(a, elastic);
@@ -225,21 +228,8 @@ class Stepper {
     for (int part = 0; part < w_.part_count; ++part) least = lesser(least, w_.parts[0][part].least);
     for (int lane = 0; lane < width; ++lane) least_[lane] = Lanes::lane(Lanes::widen(least), lane);
     team_.barrier();
-    set_weights(false);
+    sweep_.set_weights(call_.material.stiffness, false, environment_of);
     team_.barrier();
-  }
-
-  // w V, times l_e when `bounded`
-  void set_weights(bool bounded) {
-    const int lanes = w_.shared_weight ? 1 : width;
-    const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
-    for (std::int64_t e = team_.begin(elements); e < team_.end(elements); ++e) {
-      const T volume = plan_.tet_volume[e] * (bounded ? plan_.tet_bound[e] : T(1));
-      for (int lane = 0; lane < lanes; ++lane) {
-        w_.weight[e * lanes + lane] =
-            volume * call_.material.stiffness.of(in_.environment(lane))[plan_.tet_order[e]];
-      }
-    }
   }
 
   void update(std::int64_t i, const Value& force, Sum& sums) {

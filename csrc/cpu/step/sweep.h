@@ -4,7 +4,7 @@
 // pass that adds the patches' forces in patch order. The plan fixes the partition, so the bits do not depend on
 // threads.
 #pragma once
-#include "cpu/step/element_blocks.h"
+#include "cpu/step/stencil_blocks.h"
 #include "cpu/step/workspace.h"
 #include "elements/solid.h"
 #include "threads/team.h"
@@ -33,6 +33,19 @@ struct Sums {
   typename Lanes::Value energy, first, second;
   typename Lanes::Real least;
 };
+
+// One operation on all elements: of tetrahedra, see each_element, and of stencils, see elements/stencil.h.
+template <class Solid, class Stencil>
+struct Elements {
+  Solid solid;
+  Stencil stencil;
+};
+
+template <bool Energy>
+constexpr Elements<SolidGradient<Energy>, StencilGradient<Energy>> elastic_gradient(
+    bool wanted = true) {
+  return {{wanted}, {wanted}};
+}
 
 template <class Lanes>
 struct Sweep {
@@ -64,9 +77,9 @@ struct Sweep {
                                 sums.least};
   }
 
-  // element: see each_element; the second field is the direction. visit(vertex, force, sums)
-  template <int Fields = 1, class Element, class Visit>
-  void run(int parity, Element element, Visit visit) {
+  // the second field is the direction; visit(vertex, force, sums)
+  template <int Fields = 1, class Solid, class Stencil, class Visit>
+  void run(int parity, const Elements<Solid, Stencil>& element, Visit visit) {
     for (int patch = team.begin(plan.patches); patch < team.end(plan.patches); ++patch) {
       LaneSums<Lanes> lanes;
       lanes.clear();
@@ -83,6 +96,42 @@ struct Sweep {
       record(parity, plan.patches + chunk, sums, Wide(0.0));
     }
     team.barrier();
+  }
+
+  // Numbers of a step of every element: w V of tetrahedra, times l_e when `bounded`, and those of the stencils.
+  // `environment_of(lane)`: the environment whose material a lane has
+  template <class EnvironmentOf>
+  void set_weights(const Values<T>& stiffness, bool bounded, const EnvironmentOf& environment_of) {
+    const int lanes = work.shared_weight ? 1 : Lanes::environments;
+    const std::int64_t elements = std::int64_t(plan.blocks) * block_lanes;
+    for (std::int64_t e = team.begin(elements); e < team.end(elements); ++e) {
+      const T volume = plan.tet_volume[e] * (bounded ? plan.tet_bound[e] : T(1));
+      for (int lane = 0; lane < lanes; ++lane) {
+        work.weight[e * lanes + lane] =
+            volume * stiffness.of(environment_of(lane))[plan.tet_order[e]];
+      }
+    }
+  }
+
+  template <class EnvironmentOf>
+  void set_stencil_numbers(const Effects<T>& effects, const EnvironmentOf& environment_of) {
+    const int lanes = work.shared_weight ? 1 : Lanes::environments;
+    for (std::int64_t b = team.begin(plan.stencil_blocks); b < team.end(plan.stencil_blocks); ++b) {
+      with_kind(plan.stencil_block[4 * b], [&](auto kind) {
+        using Kind = decltype(kind);
+        for (int lane = 0; lane < lanes; ++lane) {
+          const MaterialRows<Kind, T> rows(effects, environment_of(lane));
+          for (int first = 0; first < block_lanes; ++first) {
+            const StencilPart<T> part{&plan, int(b), first};
+            T number[Kind::numbers];
+            rows.read(plan.stencil_order[part.stencil()], plan.stencil_measure[part.stencil()],
+                      number);
+            for (int i = 0; i < Kind::numbers; ++i)
+              work.numbers[part.number(i) * lanes + lane] = number[i];
+          }
+        }
+      });
+    }
   }
 
   // Positions relative to the first vertex of each patch keep their last bits however far from the origin.
@@ -108,8 +157,8 @@ struct Sweep {
   }
 
  private:
-  template <int Fields, class Element>
-  void elements_of(int patch, LaneSums<Lanes>& lanes, const Element& element) {
+  template <int Fields, class Solid, class Stencil>
+  void elements_of(int patch, LaneSums<Lanes>& lanes, const Elements<Solid, Stencil>& element) {
     gather_slots<Fields>(patch);
     const int count = plan.patch_slot[patch + 1] - plan.patch_slot[patch];
     const Real zero(T(0));
@@ -119,10 +168,16 @@ struct Sweep {
     fields[0] = scratch.x;
     if constexpr (Fields == 2) fields[1] = scratch.direction;
     const auto& corners = const_cast<const Value* const(&)[Fields]>(fields);
-    using Elements = typename ElementsOf<Fields, Lanes>::type;
+    using Tets = typename ElementsOf<Fields, Lanes>::type;
     each_element(plan, patch,
-                 Elements(plan, corners, work.weight, work.shared_weight, scratch.force, lanes),
-                 element);
+                 Tets(plan, corners, work.weight, work.shared_weight, scratch.force, lanes),
+                 element.solid);
+    if (plan.stencil_blocks == 0) return;
+    each_stencil<Lanes>(plan, patch, [&](auto kind, const StencilPart<T>& part) {
+      using Kind = decltype(kind);
+      element.stencil.template run<Kind>(StencilsAcross<Kind, Fields, Lanes>{
+          part, corners, work.numbers, work.shared_weight, scratch.force, lanes});
+    });
   }
 
   template <class Visit>

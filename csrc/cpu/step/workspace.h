@@ -31,6 +31,18 @@ struct ComponentSums {
   bool tips, still;  // in some environment
 };
 
+// Whether all environments have the same elastic material.
+template <class T>
+bool shares_elasticity(const Material<T>& material) {
+  bool shared = material.stiffness.stride == 0;
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning) \
+  shared = shared && material.effects.name.stride == 0;
+#include "views/material.def"
+#undef X
+  return shared;
+}
+
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers
 
 template <class Lanes>
@@ -60,12 +72,13 @@ struct Workspace {
   Plane<Real>* planes;
   Sphere<Real>* spheres;
   T* weight;  // [elements], or [elements, W] when stiffness differs between environments
+  T* numbers;  // the same of stencils: [rows of 16 numbers of a step]
   int part_count;
   bool shared_weight;
   bool some_go_on = false;  // some environment moves in the next leg
 
   explicit Workspace(const StepCall<T>& call)
-      : Workspace(call.plan, call.material, call.material.stiffness.stride == 0,
+      : Workspace(call.plan, call.material, shares_elasticity(call.material),
                   call.forces != nullptr) {}
 
   explicit Workspace(const FieldCall<T>& call) : Workspace(call.plan, {}, true, false) {}
@@ -109,6 +122,10 @@ struct Workspace {
     place(spheres, material.spheres_count, base);
     place(weight,
           std::int64_t(plan.blocks) * block_lanes * (shared_weight ? 1 : Lanes::environments),
+          base);
+    place(numbers,
+          std::int64_t(plan.stencil_numbers) * block_lanes *
+              (shared_weight ? 1 : Lanes::environments),
           base);
   }
 

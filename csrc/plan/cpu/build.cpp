@@ -2,6 +2,7 @@
 
 #include "plan/mesh/partition.h"
 #include "plan/mesh/rest_shape.h"
+#include "plan/mesh/stencils.h"
 
 #include <algorithm>
 
@@ -12,7 +13,7 @@ namespace {
 constexpr int lanes = 16;
 
 // Slots of one patch: its interior vertices in their order, then the shared ones as they appear.
-void add_slots(MeshPlan& plan, const Numbering& n, const std::int64_t* tets,
+void add_slots(MeshPlan& plan, const Numbering& n, const MeshElements& elements,
                std::span<const std::int32_t> patch, std::vector<std::int32_t>& slot_of) {
   const std::int32_t begin = plan.patch_slot.back();
   const std::size_t number = plan.patch_slot.size() - 1;
@@ -20,9 +21,8 @@ void add_slots(MeshPlan& plan, const Numbering& n, const std::int64_t* tets,
     slot_of[n.vertex_order[v]] = std::int32_t(plan.slot_vertex.size()) - begin;
     plan.slot_vertex.push_back(v);
   }
-  for (const std::int32_t t : patch) {
-    for (int k = 0; k < 4; ++k) {
-      const std::int64_t v = tets[4 * std::int64_t(t) + k];
+  for (const std::int32_t e : patch) {
+    for (const std::int64_t v : elements.corners(e)) {
       if (!n.is_shared[v] || slot_of[v] >= 0) continue;
       slot_of[v] = std::int32_t(plan.slot_vertex.size()) - begin;
       plan.slot_vertex.push_back(n.internal[v]);
@@ -31,9 +31,10 @@ void add_slots(MeshPlan& plan, const Numbering& n, const std::int64_t* tets,
   plan.patch_slot.push_back(std::int32_t(plan.slot_vertex.size()));
 }
 
-// Blocks of one patch. Neighbours go to different blocks, so that lanes of a block rarely add to the same vertex.
-void add_blocks(MeshPlan& plan, const double* x, const std::int64_t* tets,
-                std::span<const std::int32_t> patch, const std::vector<std::int32_t>& slot_of) {
+// Blocks of tetrahedra of one patch. Neighbours go to different blocks, so that lanes of a block rarely add to the same vertex.
+void add_blocks(MeshPlan& plan, const MeshElements& elements, std::span<const std::int32_t> patch,
+                const std::vector<std::int32_t>& slot_of) {
+  const double* x = elements.positions;
   const std::int64_t count = std::ssize(patch), blocks = (count + lanes - 1) / lanes;
   for (std::int64_t b = 0; b < blocks; ++b) {
     const std::size_t block = plan.tet_order.size() / lanes;
@@ -45,7 +46,7 @@ void add_blocks(MeshPlan& plan, const double* x, const std::int64_t* tets,
     for (int lane = 0; lane < lanes; ++lane) {
       const std::int64_t i = lane * blocks + b;
       const std::int32_t t = patch[std::min(i, count - 1)];
-      const std::int64_t* corner = tets + 4 * std::int64_t(t);
+      const std::int64_t* corner = elements.tets + 4 * std::int64_t(t);
       const Rest rest = rest_of(x, {corner[0], corner[1], corner[2], corner[3]});
       const auto face = face_rest<4>(x, {corner[0], corner[1], corner[2], corner[3]});
       plan.tet_order[block * lanes + lane] = t;
@@ -60,23 +61,75 @@ void add_blocks(MeshPlan& plan, const double* x, const std::int64_t* tets,
   plan.patch_block.push_back(std::int32_t(plan.tet_order.size() / lanes));
 }
 
+// Blocks of one patch's stencils of one group; `patch`: numbers of elements, `first` that of the group's first.
+void add_stencils(MeshPlan& plan, const StencilGroup& group, std::span<const std::int32_t> patch,
+                  std::int64_t first, const std::vector<std::int32_t>& slot_of) {
+  const std::int64_t count = std::ssize(patch), blocks = (count + lanes - 1) / lanes;
+  const int stored = stored_gradient_numbers(group) + group.constants;
+  for (std::int64_t b = 0; b < blocks; ++b) {
+    const auto rows = [](const auto& array) { return std::int32_t(array.size() / lanes); };
+    const std::size_t corner = plan.stencil_corner.size(), number = plan.stencil_stored.size();
+    plan.stencil_block.insert(plan.stencil_block.end(),
+                              {group.kind, rows(plan.stencil_corner), rows(plan.stencil_stored),
+                               plan.stencil_numbers});
+    plan.stencil_numbers += group.numbers;
+    plan.stencil_corner.resize(corner + group.corners * lanes);
+    plan.stencil_stored.resize(number + stored * lanes);
+    for (int lane = 0; lane < lanes; ++lane) {
+      const std::int64_t i = lane * blocks + b;
+      const std::int64_t s = patch[std::min(i, count - 1)] - first;
+      plan.stencil_order.push_back(std::int32_t(s));
+      plan.stencil_measure.push_back(i < count ? group.measure[s] : 0);
+      plan.stencil_bound.push_back(stencil_bound(group, s));
+      for (int c = 0; c < group.corners; ++c) {
+        plan.stencil_corner[corner + c * lanes + lane] =
+            std::int16_t(slot_of[group.corner[s * group.corners + c]]);
+      }
+      const std::vector<double> gradients = stored_gradients(group, s);
+      for (int n = 0; n < stored; ++n) {
+        const int constant = n - int(gradients.size());
+        plan.stencil_stored[number + n * lanes + lane] =
+            constant < 0 ? gradients[n] : group.constant[s * group.constants + constant];
+      }
+    }
+  }
+}
+
+// Splits a patch, whose elements ascend, at its groups.
+void add_elements(MeshPlan& plan, const MeshElements& elements, std::span<const std::int32_t> patch,
+                  const std::vector<std::int32_t>& slot_of) {
+  const auto before = [&](std::int64_t end) {
+    return std::size_t(std::lower_bound(patch.begin(), patch.end(), end) - patch.begin());
+  };
+  std::int64_t first = elements.tet_count;
+  std::size_t begin = before(first);
+  add_blocks(plan, elements, patch.first(begin), slot_of);
+  for (const StencilGroup& group : elements.groups) {
+    const std::size_t end = before(first + group.count);
+    add_stencils(plan, group, patch.subspan(begin, end - begin), first, slot_of);
+    first += group.count;
+    begin = end;
+  }
+  plan.patch_stencil.push_back(std::int32_t(plan.stencil_block.size() / 4));
+}
+
 }  // namespace
 
-MeshPlan build_plan(const double* positions, std::int64_t vertices, const std::int64_t* tets,
-                    std::int64_t count, int patch_size,
+MeshPlan build_plan(const MeshElements& elements, int patch_size,
                     const std::function<void(double)>& progress) {
   const Partition mesh =
-      partition_mesh(positions, tets, count, (count + patch_size - 1) / patch_size, lanes);
+      partition_mesh(elements, (elements.count() + patch_size - 1) / patch_size, lanes);
   progress(0.3);
 
-  Numbering numbering = number_vertices(mesh, tets, vertices);
+  Numbering numbering = number_vertices(mesh, elements);
   MeshPlan plan;
   plan.patch_block.push_back(0);
   plan.patch_slot.push_back(0);
-  std::vector<std::int32_t> slot_of(vertices, -1);
+  plan.patch_stencil.push_back(0);
+  std::vector<std::int32_t> slot_of(elements.vertices, -1);
   for (int p = 0; p < mesh.patches(); ++p) {
-    add_slots(plan, numbering, tets, mesh.patch(p), slot_of);
-    add_blocks(plan, positions, tets, mesh.patch(p), slot_of);
+    add_slots(plan, numbering, elements, mesh.patch(p), slot_of);
+    add_elements(plan, elements, mesh.patch(p), slot_of);
     for (std::int32_t s = plan.patch_slot[p]; s < plan.patch_slot[p + 1]; ++s) {
       slot_of[numbering.vertex_order[plan.slot_vertex[s]]] = -1;
     }

@@ -279,8 +279,9 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
     mesh.owner = std::move(owned.owner);
     mesh.numbering = number_owned(mesh.owner, patches);
   } else {
-    mesh.partition = partition_mesh(positions, tets, count, patches, 1);
-    mesh.numbering = number_vertices(mesh.partition, tets, vertices);
+    const MeshElements elements{positions, vertices, tets, count};
+    mesh.partition = partition_mesh(elements, patches, 1);
+    mesh.numbering = number_vertices(mesh.partition, elements);
   }
   progress(0.4);
   const std::vector<MeshPatch> made = make_patches(mesh, vertices);

@@ -105,8 +105,8 @@ Ownership own_vertices(const double* positions, std::int64_t vertices, const std
   for (std::int64_t v = 0; v < vertices; ++v) own[owned.owner[v]].push_back(std::int32_t(v));
   for (const std::vector<std::int32_t>& mine : own) {
     const std::vector<std::int32_t> touched = cutter.tets_of(mine);
-    owned.mesh.tets.insert(owned.mesh.tets.end(), touched.begin(), touched.end());
-    owned.mesh.start.push_back(std::ssize(owned.mesh.tets));
+    owned.mesh.elements.insert(owned.mesh.elements.end(), touched.begin(), touched.end());
+    owned.mesh.start.push_back(std::ssize(owned.mesh.elements));
   }
   return owned;
 }

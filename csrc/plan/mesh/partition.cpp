@@ -9,14 +9,16 @@ namespace pd {
 
 namespace {
 
-// The least coordinates of every tetrahedron's corners. With this order a cut shares only the vertices on one of its
+// The least coordinates of every element's corners. With this order a cut shares only the vertices on one of its
 // sides; an order by centres shares some on both.
-std::vector<Point> low_corners(const double* x, const std::int64_t* tets, std::int64_t count) {
-  std::vector<Point> low(count);
-  for (std::int64_t t = 0; t < count; ++t) {
+std::vector<Point> low_corners(const MeshElements& elements) {
+  std::vector<Point> low(elements.count());
+  for (std::int64_t e = 0; e < std::ssize(low); ++e) {
+    const std::span<const std::int64_t> corners = elements.corners(e);
     for (int c = 0; c < 3; ++c) {
-      low[t][c] = x[3 * tets[4 * t] + c];
-      for (int k = 1; k < 4; ++k) low[t][c] = std::min(low[t][c], x[3 * tets[4 * t + k] + c]);
+      low[e][c] = elements.positions[3 * corners[0] + c];
+      for (const std::int64_t v : corners)
+        low[e][c] = std::min(low[e][c], elements.positions[3 * v + c]);
     }
   }
   return low;
@@ -33,13 +35,13 @@ void bisect(std::vector<std::int32_t>& items, const std::vector<Point>& corners,
 void divide(Partition& mesh, const std::vector<Point>& corners, std::int64_t begin,
             std::int64_t end, std::int64_t patches, std::int64_t grain) {
   if (patches <= 1) {
-    std::sort(mesh.tets.begin() + begin, mesh.tets.begin() + end);
+    std::sort(mesh.elements.begin() + begin, mesh.elements.begin() + end);
     mesh.start.push_back(end);
     return;
   }
   const std::int64_t grains = (end - begin + grain - 1) / grain, left = patches / 2;
   const std::int64_t middle = std::min(end, begin + grains * left / patches * grain);
-  if (middle > begin && middle < end) bisect(mesh.tets, corners, begin, middle, end);
+  if (middle > begin && middle < end) bisect(mesh.elements, corners, begin, middle, end);
   divide(mesh, corners, begin, middle, left, grain);
   divide(mesh, corners, middle, end, patches - left, grain);
 }
@@ -47,16 +49,16 @@ void divide(Partition& mesh, const std::vector<Point>& corners, std::int64_t beg
 // Orders shared vertices so that those of the same patches are adjacent, and one patch reads another's in a run. The
 // sort key is the reversed list of patches: the last patch has all forces on them. `shared` keeps its order
 // otherwise.
-void gather_by_patches(const Partition& mesh, const std::int64_t* tets,
+void gather_by_patches(const Partition& mesh, const MeshElements& elements,
                        const std::vector<std::uint8_t>& is_shared,
                        std::vector<std::int64_t>& shared) {
   std::vector<std::int32_t> number(is_shared.size(), -1);
   for (std::size_t i = 0; i < shared.size(); ++i) number[shared[i]] = std::int32_t(i);
   std::vector<std::vector<std::int32_t>> patches(shared.size());
   for (int p = 0; p < mesh.patches(); ++p) {
-    for (const std::int32_t t : mesh.patch(p)) {
-      for (int k = 0; k < 4; ++k) {
-        const std::int32_t i = number[tets[4 * std::int64_t(t) + k]];
+    for (const std::int32_t e : mesh.patch(p)) {
+      for (const std::int64_t v : elements.corners(e)) {
+        const std::int32_t i = number[v];
         if (i >= 0 && (patches[i].empty() || patches[i].back() != p)) patches[i].push_back(p);
       }
     }
@@ -69,15 +71,16 @@ void gather_by_patches(const Partition& mesh, const std::int64_t* tets,
 
 }  // namespace
 
-Partition partition_mesh(const double* positions, const std::int64_t* tets, std::int64_t count,
-                         std::int64_t patches, std::int64_t grain) {
+Partition partition_mesh(const MeshElements& elements, std::int64_t patches, std::int64_t grain) {
+  const std::int64_t count = elements.count();
   Partition mesh{std::vector<std::int32_t>(count), {0}};
-  std::iota(mesh.tets.begin(), mesh.tets.end(), 0);
-  divide(mesh, low_corners(positions, tets, count), 0, count, patches, grain);
+  std::iota(mesh.elements.begin(), mesh.elements.end(), 0);
+  divide(mesh, low_corners(elements), 0, count, patches, grain);
   return mesh;
 }
 
-Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::int64_t vertices) {
+Numbering number_vertices(const Partition& mesh, const MeshElements& elements) {
+  const std::int64_t vertices = elements.vertices;
   Numbering n;
   n.is_shared.assign(vertices, 0);
   n.internal.assign(vertices, -1);
@@ -85,9 +88,8 @@ Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::
   std::vector<std::int64_t> by_owner;             // in order of first appearance
   by_owner.reserve(vertices);
   for (int p = 0; p < mesh.patches(); ++p) {
-    for (const std::int32_t t : mesh.patch(p)) {
-      for (int k = 0; k < 4; ++k) {
-        const std::int64_t v = tets[4 * std::int64_t(t) + k];
+    for (const std::int32_t e : mesh.patch(p)) {
+      for (const std::int64_t v : elements.corners(e)) {
         if (owner[v] < 0) {
           owner[v] = p;
           by_owner.push_back(v);
@@ -112,7 +114,7 @@ Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::
       ++n.patch_vertex[owner[v] + 1];
     }
   }
-  gather_by_patches(mesh, tets, n.is_shared, shared);
+  gather_by_patches(mesh, elements, n.is_shared, shared);
   for (const std::int64_t v : shared) append(v);
   std::partial_sum(n.patch_vertex.begin(), n.patch_vertex.end(), n.patch_vertex.begin());
   return n;

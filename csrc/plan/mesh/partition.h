@@ -1,27 +1,28 @@
 // Cuts a mesh into patches and numbers its vertices by them: the first half of both plans.
 #pragma once
 
+#include "plan/mesh/elements.h"
+
 #include <cstdint>
 #include <span>
 #include <vector>
 
 namespace pd {
 
-// Tetrahedra patch by patch, ascending in each.
+// Elements patch by patch, ascending in each.
 struct Partition {
-  std::vector<std::int32_t> tets;   // user's numbers
-  std::vector<std::int64_t> start;  // first of each patch, and the end
+  std::vector<std::int32_t> elements;  // numbers of MeshElements
+  std::vector<std::int64_t> start;     // first of each patch, and the end
 
   int patches() const { return int(start.size()) - 1; }
   std::span<const std::int32_t> patch(int p) const {
-    return {tets.data() + start[p], tets.data() + start[p + 1]};
+    return {elements.data() + start[p], elements.data() + start[p + 1]};
   }
 };
 
 // Recursive coordinate bisection into patches of nearly equal size: a multiple of `grain`, but for the last.
-// `positions` [vertices, 3], `tets` [count, 4]; up to count / grain patches, rounded up.
-Partition partition_mesh(const double* positions, const std::int64_t* tets, std::int64_t count,
-                         std::int64_t patches, std::int64_t grain);
+// Up to count / grain patches, rounded up.
+Partition partition_mesh(const MeshElements& elements, std::int64_t patches, std::int64_t grain);
 
 // Which vertices are interior to one patch and which are shared, and their internal numbers.
 struct Numbering {
@@ -37,7 +38,7 @@ struct Numbering {
   }
 };
 
-Numbering number_vertices(const Partition& mesh, const std::int64_t* tets, std::int64_t vertices);
+Numbering number_vertices(const Partition& mesh, const MeshElements& elements);
 
 // For every shared vertex its slots, in patch order.
 struct SharedSlots {

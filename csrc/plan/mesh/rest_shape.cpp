@@ -46,10 +46,10 @@ Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
   const Vec3<double> n0 = -((n[0] + n[1]) + n[2]);
   return {{n[0].x, n[0].y, n[0].z, n[1].x, n[1].y, n[1].z, n[2].x, n[2].y, n[2].z},
           det / 6,
-          element_bound({{{n0.x, n0.y, n0.z},
-                          {n[0].x, n[0].y, n[0].z},
-                          {n[1].x, n[1].y, n[1].z},
-                          {n[2].x, n[2].y, n[2].z}}})};
+          element_bound(std::array<std::array<double, 3>, 4>{{{n0.x, n0.y, n0.z},
+                                                              {n[0].x, n[0].y, n[0].z},
+                                                              {n[1].x, n[1].y, n[1].z},
+                                                              {n[2].x, n[2].y, n[2].z}}})};
 }
 
 template <std::size_t Corners>
@@ -79,11 +79,12 @@ std::array<double, 3 * (Corners - 2)> face_rest(const double* positions,
 template std::array<double, 6> face_rest(const double*, const std::array<std::int64_t, 4>&);
 template std::array<double, 9> face_rest(const double*, const std::array<std::int64_t, 5>&);
 
-double element_bound(const std::array<std::array<double, 3>, 4>& gradients) {
+double element_bound(std::span<const std::array<double, 3>> gradients) {
   // the nonzero eigenvalues of S S^T, S the normalised gradients, are those of the 3x3 matrix S^T S
   Mat3<double> sum = {};
   for (const auto& g : gradients) {
     const Vec3<double> n = {g[0], g[1], g[2]};
+    if (dot(n, n) == 0) continue;
     const Vec3<double> unit = (1 / std::sqrt(dot(n, n))) * n;
     sum = {{sum.row[0] + unit.x * unit, sum.row[1] + unit.y * unit, sum.row[2] + unit.z * unit}};
   }

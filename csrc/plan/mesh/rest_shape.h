@@ -3,6 +3,7 @@
 
 #include <array>
 #include <cstdint>
+#include <span>
 
 namespace pd {
 
@@ -22,7 +23,8 @@ template <std::size_t Corners>
 std::array<double, 3 * (Corners - 2)> face_rest(const double* positions,
                                                 const std::array<std::int64_t, Corners>& vertex);
 
-// l_e from shape gradients: the largest eigenvalue of diag(K)^-1/2 K diag(K)^-1/2, K = grad N grad N^T.
-double element_bound(const std::array<std::array<double, 3>, 4>& gradients);
+// l_e from shape gradients: the largest eigenvalue of diag(K)^-1/2 K diag(K)^-1/2, K = grad N grad N^T. Gradients of
+// zero, of corners without a share, count nothing.
+double element_bound(std::span<const std::array<double, 3>> gradients);
 
 }  // namespace pd

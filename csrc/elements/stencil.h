@@ -1,0 +1,225 @@
+// A stencil: n vertices with constant vectors g_a in R^d that add up to zero, and an energy of F.
+//
+//   F = sum_a x_a (x) g_a   (3 x d),   E = V psi(F),   dE/dx_a = V P g_a,   P = dpsi/dF
+//
+// psi is mu |F|^2 + kappa(h(F)), h the largest tr(Q^T F) over a set of Q, with kappa' <= 0 and kappa'' <= k. Then the
+// diagonal of V |g_a|^2 (2 mu l_e + n k) majorises E everywhere, l_e as in solver/step.h: (h' - h)^2 <= n sum_a |g_a|^2
+// |d_a|^2 for displacements d, and convexity of h bounds the rest.
+//
+// A kind is a struct:
+//   corners, dims, constants, rows, numbers    n, d, stored constants, arrays of the material, numbers of a step
+//   parameters(row, V, p)        numbers p of a step from the rows of the material; energies are scaled by V
+//   stress<Energy>(f, p, c, P, energy)         V P, and adds V psi to `energy`; c: constants
+//   weight(p, l, n)              V (2 mu l + n k); with l = n = 1 the stiffness at rest, for preconditioners
+// Second derivatives and derivatives by the material follow from `stress` with dual numbers.
+#pragma once
+#include "math/dual.h"
+#include "math/vec.h"
+#include "views/views.h"
+
+namespace pd::inline PD_TARGET {
+
+// Numbers that store the vectors g_a. A rotation of R^d, which changes no energy, makes column j of F a combination of
+// the first n - d + j edges x_a - x_0 alone.
+template <class Kind>
+constexpr int gradient_numbers =
+    Kind::dims * (Kind::corners - Kind::dims) + Kind::dims * (Kind::dims - 1) / 2;
+template <class Kind>
+constexpr int stored_numbers = gradient_numbers<Kind> + Kind::constants;
+// an array may not be empty
+template <class Kind>
+constexpr int constant_slots = Kind::constants > 0 ? Kind::constants : 1;
+
+// F, column by column
+template <class Kind, class R, class Stored>
+PD_HD void deform(const Vec3<R> (&x)[Kind::corners], const Stored& g, Vec3<R> (&f)[Kind::dims]) {
+  constexpr int n = Kind::corners, d = Kind::dims;
+  Vec3<R> edge[n - 1];
+  for (int a = 0; a < n - 1; ++a) edge[a] = x[a + 1] - x[0];
+  int at = 0;
+  for (int j = 0; j < d; ++j) {
+    for (int a = 0; a < n - d + j; ++a, ++at)
+      f[j] = a == 0 ? R(g[at]) * edge[a] : multiply_add(R(g[at]), edge[a], f[j]);
+  }
+}
+
+// P g_a of every corner
+template <class Kind, class R, class Stored>
+PD_HD void stencil_forces(const Vec3<R> (&p)[Kind::dims], const Stored& g,
+                          Vec3<R> (&force)[Kind::corners]) {
+  constexpr int n = Kind::corners, d = Kind::dims;
+  int at = 0;
+  for (int j = 0; j < d; ++j) {
+    for (int a = 0; a < n - d + j; ++a, ++at) {
+      const bool first = j == 0 || a == n - d + j - 1;
+      force[a + 1] = first ? R(g[at]) * p[j] : multiply_add(R(g[at]), p[j], force[a + 1]);
+    }
+  }
+  Vec3<R> sum = force[1];
+  for (int a = 2; a < n; ++a) sum = sum + force[a];
+  force[0] = -sum;
+}
+
+// |g_a|^2 of every corner
+template <class Kind, class R>
+PD_HD void gradient_squares(const R (&g)[gradient_numbers<Kind>], R (&square)[Kind::corners]) {
+  constexpr int n = Kind::corners, d = Kind::dims;
+  Vec3<R> axes[d], force[n];
+  for (R& s : square) s = R(scalar_of<R>(0));
+  for (int j = 0; j < d; ++j) {
+    const R none(scalar_of<R>(0)), one(scalar_of<R>(1));
+    for (int i = 0; i < d; ++i) axes[i] = {i == j ? one : none, none, none};
+    stencil_forces<Kind>(axes, g, force);
+    for (int a = 0; a < n; ++a) square[a] = multiply_add(force[a].x, force[a].x, square[a]);
+  }
+}
+
+// The second derivative of the energy along df: dP
+template <class Kind, class R>
+PD_HD void stress_differential(const Vec3<R> (&f)[Kind::dims], const Vec3<R> (&df)[Kind::dims],
+                               const R (&p)[Kind::numbers], const R (&c)[constant_slots<Kind>],
+                               Vec3<R> (&dp)[Kind::dims]) {
+  using D = Dual<R>;
+  const R none(scalar_of<R>(0));
+  Vec3<D> at[Kind::dims], stress[Kind::dims];
+  D numbers[Kind::numbers], constants[constant_slots<Kind>], energy(none, none);
+  for (int j = 0; j < Kind::dims; ++j)
+    at[j] = {D(f[j].x, df[j].x), D(f[j].y, df[j].y), D(f[j].z, df[j].z)};
+  for (int i = 0; i < Kind::numbers; ++i) numbers[i] = D(p[i], none);
+  for (int i = 0; i < constant_slots<Kind>; ++i) constants[i] = D(c[i], none);
+  Kind::template stress<false>(at, numbers, constants, stress, energy);
+  for (int j = 0; j < Kind::dims; ++j)
+    dp[j] = {stress[j].x.slope, stress[j].y.slope, stress[j].z.slope};
+}
+
+// Derivatives by one row of the material, `which`: of the energy, and of P : df
+template <class Kind, class R>
+struct RowDerivative {
+  R energy, product;
+
+  PD_HD RowDerivative(int which, const R (&row)[Kind::rows], const R& measure,
+                      const Vec3<R> (&f)[Kind::dims], const Vec3<R> (&df)[Kind::dims],
+                      const R (&c)[constant_slots<Kind>]) {
+    using D = Dual<R>;
+    const R none(scalar_of<R>(0)), one(scalar_of<R>(1));
+    D rows[Kind::rows], numbers[Kind::numbers], constants[constant_slots<Kind>], sum(none, none);
+    for (int i = 0; i < Kind::rows; ++i) rows[i] = D(row[i], i == which ? one : none);
+    for (int i = 0; i < constant_slots<Kind>; ++i) constants[i] = D(c[i], none);
+    Kind::parameters(rows, D(measure, none), numbers);
+    Vec3<D> at[Kind::dims], stress[Kind::dims];
+    for (int j = 0; j < Kind::dims; ++j)
+      at[j] = {D(f[j].x, none), D(f[j].y, none), D(f[j].z, none)};
+    Kind::template stress<true>(at, numbers, constants, stress, sum);
+    energy = sum.slope;
+    product = none;
+    for (int j = 0; j < Kind::dims; ++j) {
+      const Vec3<R> slope = {stress[j].x.slope, stress[j].y.slope, stress[j].z.slope};
+      product = product + dot(slope, df[j]);
+    }
+  }
+};
+
+// What an operation reads of the stencils that it works on: see StencilsAcross.
+template <class Kind, class Stencils>
+struct StencilNumbers {
+  using R = typename Stencils::R;
+  R g[gradient_numbers<Kind>], c[constant_slots<Kind>], p[Kind::numbers];
+
+  PD_HD explicit StencilNumbers(const Stencils& stencils) {
+    for (int i = 0; i < gradient_numbers<Kind>; ++i) g[i] = stencils.stored(i);
+    for (int i = 0; i < constant_slots<Kind>; ++i)
+      c[i] = i < Kind::constants ? stencils.stored(gradient_numbers<Kind> + i)
+                                 : R(scalar_of<R>(0));
+    for (int i = 0; i < Kind::numbers; ++i) p[i] = stencils.number(i);
+  }
+};
+
+// Gradient on the corners. With `Energy` and `wanted` also the energy.
+template <bool Energy>
+struct StencilGradient {
+  bool wanted = true;
+
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    using R = typename Stencils::R;
+    const StencilNumbers<Kind, Stencils> s(stencils);
+    Vec3<R> x[Kind::corners], f[Kind::dims], p[Kind::dims];
+    stencils.corners(0, x);
+    deform<Kind>(x, s.g, f);
+    R energy(scalar_of<R>(0));
+    Kind::template stress<Energy>(f, s.p, s.c, p, energy);
+    if (Energy && wanted) stencils.sum() = stencils.sum() + energy;
+    stencil_forces<Kind>(p, s.g, x);
+    stencils.add(x);
+  }
+};
+
+// No work on stencils.
+struct NoStencils {
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils&) const {}
+};
+
+// Second derivative of every energy at field 0, along field 1.
+struct StencilHessian {
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    using R = typename Stencils::R;
+    const StencilNumbers<Kind, Stencils> s(stencils);
+    Vec3<R> x[Kind::corners], f[Kind::dims], df[Kind::dims], dp[Kind::dims];
+    stencils.corners(0, x);
+    deform<Kind>(x, s.g, f);
+    stencils.corners(1, x);
+    deform<Kind>(x, s.g, df);
+    stress_differential<Kind>(f, df, s.p, s.c, dp);
+    stencil_forces<Kind>(dp, s.g, x);
+    stencils.add(x);
+  }
+};
+
+// Diagonal of the majoriser, or of the stiffness at rest without `bounded`. It is minus infinity where the material is
+// negative, so that no neighbour can compensate.
+struct StencilDiagonal {
+  bool bounded = true;
+
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    using R = typename Stencils::R;
+    const StencilNumbers<Kind, Stencils> s(stencils);
+    const R none(scalar_of<R>(0)), one(scalar_of<R>(1)), corners{scalar_of<R>(Kind::corners)};
+    const R weight = bounded ? Kind::weight(s.p, stencils.bound(), corners)
+                             : Kind::weight(s.p, one, one);
+    R square[Kind::corners];
+    gradient_squares<Kind>(s.g, square);
+    Vec3<R> d[Kind::corners];
+    for (int a = 0; a < Kind::corners; ++a) {
+      const R entry = select(weight < none, R(-HUGE_VAL), weight * square[a]);
+      d[a] = {entry, entry, entry};
+    }
+    stencils.add(d);
+  }
+};
+
+// Terms of a report for each corner: its share of the energy; the force per relative error of positions; none inverted.
+struct StencilReport {
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    using R = typename Stencils::R;
+    using T = scalar_of<R>;
+    const StencilNumbers<Kind, Stencils> s(stencils);
+    const R none(T(0)), one(T(1));
+    Vec3<R> x[Kind::corners], f[Kind::dims], p[Kind::dims];
+    stencils.corners(0, x);
+    deform<Kind>(x, s.g, f);
+    R energy = none, size = none, square[Kind::corners];
+    Kind::template stress<true>(f, s.p, s.c, p, energy);
+    for (int a = 0; a < Kind::corners; ++a) size = -lesser(-size, -dot(x[a], x[a]));
+    size = square_root(size);
+    gradient_squares<Kind>(s.g, square);
+    const R share = R(T(1) / T(Kind::corners)) * energy, weight = Kind::weight(s.p, one, one);
+    for (int a = 0; a < Kind::corners; ++a) x[a] = {share, (weight * square[a]) * size, none};
+    stencils.add(x);
+  }
+};
+
+}  // namespace pd::inline PD_TARGET
