@@ -12,9 +12,11 @@ from .geometry.embedding import Embedding
 from .geometry.tet_mesh import MeshWarning, TetMesh, embed
 from .geometry.tetrahedralize import tetrahedralize
 from .geometry.tri_mesh import TriMesh
+from .scene.cloth import Cloth
 from .scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .scene.scene import Scene
 from .scene.solvers import Chebyshev, Jacobi, Multilevel
+from .scene.springs import Springs
 from .simulation.state import Info, State, Track
 from .version import __version__
 
@@ -42,6 +44,7 @@ if load_extension()[0] is not None:
 __all__ = [
     "CapturedStep",
     "Chebyshev",
+    "Cloth",
     "ContactForces",
     "Damping",
     "Embedding",
@@ -73,6 +76,7 @@ __all__ = [
     "Simulator",
     "Solid",
     "Sphere",
+    "Springs",
     "State",
     "Stress",
     "TetMesh",
