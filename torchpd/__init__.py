@@ -14,9 +14,12 @@ from .geometry.tetrahedralize import tetrahedralize
 from .geometry.tri_mesh import TriMesh
 from .scene.cloth import Cloth
 from .scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .scene.fibres import Fibres
+from .scene.rod import Rod
 from .scene.scene import Scene
 from .scene.solvers import Chebyshev, Jacobi, Multilevel
 from .scene.springs import Springs
+from .scene.tie import Tie
 from .simulation.state import Info, State, Track
 from .version import __version__
 
@@ -48,6 +51,7 @@ __all__ = [
     "ContactForces",
     "Damping",
     "Embedding",
+    "Fibres",
     "FitReport",
     "FreeFormPatches",
     "Gravity",
@@ -71,6 +75,7 @@ __all__ = [
     "Quadrics",
     "Reactions",
     "RigidPieces",
+    "Rod",
     "Scene",
     "SceneWarning",
     "Simulator",
@@ -80,6 +85,7 @@ __all__ = [
     "State",
     "Stress",
     "TetMesh",
+    "Tie",
     "Track",
     "TriMesh",
     "TuningWarning",

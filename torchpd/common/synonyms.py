@@ -24,7 +24,7 @@ SYNONYMS: dict[str, dict[str, str]] = {
     "": {
         "Body DeformableBody FEM FEMEntity SoftBody": "an elastic body is `Solid(mesh, youngs=..., density=...)`",
         "Garment Membrane Sheet Shell": "a sheet of triangles is `Cloth(surface, youngs=..., thickness=...)`",
-        "Cable Rope Thread": "a line is `Rod(polyline, youngs=..., radius=...)`, without bending a rope",
+        "Cable Rope Thread": "a line is `Rod(points, youngs=..., radius=...)`",
         "Spring": "`Springs(body, pairs, stiffness)` joins pairs of vertices",
         "Attach Sew Weld": "`Tie(body, vertices, other, stiffness=...)` holds vertices to points of another body",
         "Fiber Fibers Fibre Muscle Muscles": "muscles are `Fibres(solid, direction, stiffness)`",

@@ -28,11 +28,14 @@ from ..geometry.tet_mesh import TetMesh, without_face_checks
 from ..geometry.tri_mesh import TriMesh
 from ..scene.cloth import Cloth
 from ..scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from ..scene.fibres import Fibres
 from ..scene.part import Body
 from ..scene.pins import PIN_HARD
+from ..scene.rod import Rod
 from ..scene.scene import Part, Scene
 from ..scene.solvers import Chebyshev, Jacobi, Multilevel, Solver
 from ..scene.springs import Springs
+from ..scene.tie import Tie
 from ..version import __version__
 
 __all__ = ["FORMAT_VERSION", "SavedSimulation", "load_simulation", "reading", "save_simulation"]
@@ -43,10 +46,10 @@ _FIRST_ARRAYS = (
     "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets", "planes", "spheres",
 )  # fmt: skip
 _KEY = "torchpd"  # of the metadata; others may add their own keys
-_PARTS = (Solid, Cloth, Springs, Pin, Gravity, Ground, Sphere, Damping)
+_PARTS = (Solid, Cloth, Rod, Springs, Tie, Fibres, Pin, Gravity, Ground, Sphere, Damping)
 _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in _PARTS}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
-_BODIES = {"body", "other"}  # fields that hold a body of the scene
+_BODIES = {"body", "other", "solid"}  # fields that hold a body of the scene
 _LATER = {"poisson", "averaging"}  # fields of a Solid that the first files of format 2 lack
 # inputs of a preconditioner, which with the mesh determine its bits
 _REFERENCE = ("stiffness", "inertia")
@@ -307,11 +310,11 @@ def _parts(records: list[Record], meshes: list[TetMesh], tensors: _Tensors) -> l
 
 def _part(number: int, record: Record, meshes: list[TetMesh], parts: Mapping[int, Part], tensors: _Tensors) -> Part:
     kind = _KINDS[record["kind"]]
-    fields = {name: value for name, value in record.items() if name not in ("kind", "hard", "solid")}
+    fields = {name: value for name, value in record.items() if name not in ("kind", "hard")}
     if kind is Solid:
         fields["mesh"] = meshes[record["mesh"]]
     if kind is Pin:
-        fields["body"] = record["solid"]
+        fields["body"] = fields.pop("solid")
     for name in _BODIES.intersection(fields):
         fields[name] = parts[fields[name]]
     for field in dataclasses.fields(kind):

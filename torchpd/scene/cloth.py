@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -13,7 +14,7 @@ from ..common.synonyms import check_arguments
 from ..geometry.mesh_checks import warn
 from ..geometry.rest_triangles import Hinges, RestTriangles, find_hinges, rest_triangles
 from ..geometry.tri_mesh import TriMesh
-from .part import ArrayLike, Body, Place, per_item, report_size, set_fields
+from .part import ArrayLike, Body, Place, per_item, report_size, set_fields, unit_vectors
 from .stencils import StencilGroup
 
 __all__ = ["Cloth"]
@@ -114,10 +115,7 @@ class Cloth(Body):
             warp=None if warp is None else per_triangle("warp", warp, "N/m"),
             weft=None if weft is None else per_triangle("weft", weft, "N/m"),
         )
-        name, corners = ("Cloth.surface", surface.vertices[surface.triangles]) if uv is None else ("Cloth.rest_uv", uv)
-        rest = rest_triangles(name, corners, surface.triangles)
-        hinges = find_hinges("Cloth.surface", surface.triangles, rest)
-        set_fields(self, _rest=rest, _hinges=hinges)
+        hinges = self._hinges  # refuses triangles without area and edges of more than two
         set_fields(
             self,
             bending=None if bending is None else _per_hinge("bending", bending, hinges, "N m"),
@@ -126,8 +124,16 @@ class Cloth(Body):
         )
         self._directions()  # refuses a direction along a normal
 
-    _rest: RestTriangles
-    _hinges: Hinges
+    @cached_property
+    def _rest(self) -> RestTriangles:
+        triangles = self.surface.triangles
+        if self.rest_uv is not None:
+            return rest_triangles("Cloth.rest_uv", self.rest_uv, triangles)
+        return rest_triangles("Cloth.surface", self.surface.vertices[triangles], triangles)
+
+    @cached_property
+    def _hinges(self) -> Hinges:
+        return find_hinges("Cloth.surface", self.surface.triangles, self._rest)
 
     @property
     def mesh(self) -> TriMesh:
@@ -278,8 +284,4 @@ def _grain(value: Any, uv: Array | None, *, woven: bool) -> Array | None:
     grain = as_array("Cloth.grain", value, np.float64)
     size, where = (3, "a direction in space") if uv is None else (2, "a direction in rest_uv")
     check_shape("Cloth.grain", grain, (size,), where)
-    check_finite("Cloth.grain", grain)
-    length = float(np.linalg.norm(grain))
-    if length == 0.0:
-        raise ValueError(f"Cloth.grain must not be zero, got {grain.tolist()}")
-    return grain / length
+    return unit_vectors("Cloth.grain", grain[None]).reshape(size)

@@ -62,7 +62,7 @@ class Solid(Body):
         youngs: Young's modulus [Pa], a scalar or one value per tetrahedron, positive.
         density: [kg/m^3], a scalar or one value per tetrahedron, positive.
         poisson: Poisson's ratio, a scalar or one value per tetrahedron, above -1 and below 0.495. Above 0.45 a step
-            needs many iterations, and a `SceneWarning` says so. The scalar 0 leaves the law without lambda.
+            needs many iterations, and a `SceneWarning` says so. The scalar 0 compiles lambda away.
         averaging: tetrahedra that share the mean of t: 1, 2 or 4 at most, or the number of a group for each
             tetrahedron [E]. None: 2 for the lattice of `tetrahedralize`, which hardly locks, and 4 otherwise. Groups
             of 2 and 4 share faces and have similar bulk moduli.
@@ -74,7 +74,7 @@ class Solid(Body):
     mesh: TetMesh
     youngs: Array
     density: Array
-    poisson: Array | None  # [E], None for the scalar 0
+    poisson: Array | float  # [E], or 0.0
     averaging: int | Index | None
 
     @check_arguments("Solid")
@@ -84,7 +84,7 @@ class Solid(Body):
         youngs: ArrayLike,
         density: ArrayLike = 1000.0,
         *,
-        poisson: ArrayLike | None = 0.0,
+        poisson: ArrayLike = 0.0,
         averaging: int | Sequence[int] | NDArray[Any] | torch.Tensor | None = None,
     ) -> None:
         if not isinstance(mesh, TetMesh):
@@ -99,7 +99,7 @@ class Solid(Body):
             mesh=mesh,
             youngs=per_item("Solid.youngs", youngs, count, of="tetrahedron", unit="Pa"),
             density=per_item("Solid.density", density, count, of="tetrahedron", unit="kg/m^3"),
-            poisson=_poisson(0.0 if poisson is None else poisson, count),
+            poisson=_poisson(poisson, count),
             averaging=_averaging(averaging, count),
         )
 
@@ -130,18 +130,17 @@ class Solid(Body):
         """Numbers of the groups that share the mean of t [E], from 0."""
         if isinstance(self.averaging, np.ndarray):
             return np.unique(self.averaging, return_inverse=True)[1].astype(np.int64).reshape(-1)
-        nu = 0.0 if self.poisson is None else self.poisson
-        return average_over(self.mesh, self.stiffness / (3.0 * (1.0 - 2.0 * nu)), self.averaging)
+        return average_over(self.mesh, self.stiffness / (3.0 * (1.0 - 2.0 * self.poisson)), self.averaging)
 
     def _filled(self, values: Array, least: float) -> Array:
         return values if self.mesh.fill is None else values * np.maximum(self.mesh.fill, least)
 
 
-def _poisson(value: ArrayLike, count: int) -> Array | None:
+def _poisson(value: ArrayLike, count: int) -> Array | float:
     name = "Solid.poisson"
     array = as_array(name, value, np.float64)
     if array.ndim == 0 and float(array) == 0.0:
-        return None
+        return 0.0
     array = np.full(count, float(array)) if array.ndim == 0 else array
     check_shape(name, array, (count,), "one value per tetrahedron or a scalar")
     check_finite(name, array)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import FrozenInstanceError
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ __all__ = [
     "report_size",
     "selected",
     "set_fields",
+    "unit_vectors",
 ]
 
 Array = NDArray[np.float64]
@@ -40,6 +41,7 @@ Place = Callable[[Any], int]  # number in the scene of the first vertex of a bod
 
 # Bodies shorter or longer than this [m] are probably in other units.
 _SHORTEST, _LONGEST = 1e-3, 50.0
+_ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
 
 
 def set_fields(part: object, **values: Any) -> None:
@@ -119,9 +121,11 @@ def per_item(name: str, value: ArrayLike, count: int, *, of: str, unit: str, zer
     return array
 
 
-def selected(name: str, value: Any, count: int, *, of: str, items: str = "vertex") -> Index:
+def selected(
+    name: str, value: Any, count: int, *, of: str, items: Literal["vertex", "tetrahedron"] = "vertex"
+) -> Index:
     """Numbers of chosen items [P], each once, from numbers or a boolean mask [count]."""
-    plural = "vertices" if items == "vertex" else f"{items}s"
+    plural = {"vertex": "vertices", "tetrahedron": "tetrahedra"}[items]
     chosen = as_array(name, value)
     if chosen.dtype == np.bool_:
         check_shape(name, chosen, (count,), f"a mask over the {plural} of the {of}")
@@ -139,6 +143,19 @@ def selected(name: str, value: Any, count: int, *, of: str, items: str = "vertex
         numbers, counts = np.unique(chosen, return_counts=True)
         raise ValueError(f"{name} must name each {items} once, got {int(numbers[counts.argmax()])} twice")
     return np.asarray(chosen, dtype=np.int64)
+
+
+def unit_vectors(name: str, array: Array) -> Array:
+    """Vectors [N, k] of length 1. Those that are so within rounding stay as they are, to the bit."""
+    check_finite(name, array)
+    largest = np.abs(array).max(axis=1, initial=0.0)
+    bad = np.flatnonzero(largest == 0.0)
+    if bad.size:
+        raise ValueError(f"{name} must not be zero, got {array[bad[0]].tolist()} at {int(bad[0])} ({bad.size} in all)")
+    unit = array / largest[:, None]  # so that no length overflows
+    unit /= np.linalg.norm(unit, axis=1)[:, None]
+    is_unit = np.abs(np.linalg.norm(array, axis=1) - 1.0) <= _ROUNDING
+    return np.where(is_unit[:, None], array, unit)
 
 
 def _longest_side(points: Array, elements: Index) -> float:

@@ -12,14 +12,17 @@ from ..common.synonyms import check_arguments
 from ..geometry.mesh_faces import mesh_components
 from .cloth import Cloth
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .fibres import Fibres
 from .part import Body
 from .pins import PinnedComponents
+from .rod import Rod
 from .springs import Springs
 from .stencils import StencilGroup, merge_groups
+from .tie import Tie
 
 __all__ = ["Part", "Scene", "SceneValues"]
 
-Part = Solid | Cloth | Springs | Pin | Gravity | Ground | Sphere | Damping
+Part = Solid | Cloth | Rod | Springs | Tie | Fibres | Pin | Gravity | Ground | Sphere | Damping
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -60,9 +63,9 @@ class Scene:
     `SceneWarning` if they overlap at rest, and once if they overlap after a step with `return_info=True`.
 
     Args:
-        parts: bodies (`Solid`, `Cloth`), what acts on them (`Pin`, `Springs`), and `Gravity`, `Ground`, `Sphere`,
-            `Damping`. At least one body; at most one `Gravity` and one `Damping`. A part acts on bodies of this scene;
-            no vertex is pinned twice.
+        parts: bodies (`Solid`, `Cloth`, `Rod`), what acts on them (`Pin`, `Springs`, `Tie`, `Fibres`), and `Gravity`,
+            `Ground`, `Sphere`, `Damping`. At least one body; at most one `Gravity` and one `Damping`. A part acts on
+            bodies of this scene; no vertex is pinned twice.
     """
 
     @check_arguments("Scene")
@@ -82,9 +85,8 @@ class Scene:
         bodies = {id(body) for body in self.bodies}
         for part in parts:
             if any(id(body) not in bodies for body in part.bodies_used()):
-                raise ValueError(
-                    f"Scene: the body of a {type(part).__name__} must be a part of this scene, got another one; pass both"
-                )
+                words = f"the body of a {type(part).__name__} must be a part of this scene"
+                raise ValueError(f"Scene: {words}, got another one; pass both")
         numbers, counts = np.unique(self._pinned(), return_counts=True)
         if (counts > 1).any():
             raise ValueError(f"Scene: pins must hold different vertices, got two at {int(numbers[counts.argmax()])}")
@@ -130,6 +132,18 @@ class Scene:
                 return slice(start, start + len(other.mesh.vertices))
             start += len(other.mesh.vertices)
         raise ValueError("Scene.vertex_range: body must be a part of the scene, got another one")
+
+    def stencil_ranges(self, part: Part) -> dict[str, slice]:
+        """Slices of a part's stencils in the groups of `values().stencils`, by kind."""
+        counts: dict[str, int] = {}
+        for other in self.parts:
+            before = dict(counts)
+            for group in other.stencils(lambda body: 0):
+                counts[group.kind] = counts.get(group.kind, 0) + len(group)
+            if other is part:
+                kinds = [kind for kind in counts if counts[kind] > before.get(kind, 0)]
+                return {kind: slice(before.get(kind, 0), counts[kind]) for kind in kinds}
+        raise ValueError("Scene.stencil_ranges: part must be a part of the scene, got another one")
 
     def pin_range(self, pin: Pin) -> slice:
         """Slice of a pin's targets in pin_targets [P, 3]."""
@@ -187,11 +201,11 @@ class Scene:
 
     def _poisson(self) -> tuple[Array | None, Index | None]:
         """Poisson's ratios of all tetrahedra and their groups, or None if every solid has the scalar 0."""
-        if all(solid.poisson is None for solid in self.solids):
+        if all(isinstance(solid.poisson, float) for solid in self.solids):
             return None, None
         ratios, groups, count = [], [], 0
         for solid in self.solids:
-            ratios.append(np.zeros(len(solid.mesh.tets)) if solid.poisson is None else solid.poisson)
+            ratios.append(np.broadcast_to(solid.poisson, len(solid.mesh.tets)))
             groups.append(solid.averaging_groups + count)
             count = int(groups[-1].max()) + 1
         return np.concatenate(ratios), np.concatenate(groups)
