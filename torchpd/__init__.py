@@ -12,9 +12,14 @@ from .geometry.embedding import Embedding
 from .geometry.tet_mesh import MeshWarning, TetMesh, embed
 from .geometry.tetrahedralize import tetrahedralize
 from .geometry.tri_mesh import TriMesh
+from .scene.cloth import Cloth
 from .scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .scene.fibres import Fibres
+from .scene.rod import Rod
 from .scene.scene import Scene
 from .scene.solvers import Chebyshev, Jacobi, Multilevel
+from .scene.springs import Springs
+from .scene.tie import Tie
 from .simulation.state import Info, State, Track
 from .version import __version__
 
@@ -42,9 +47,11 @@ if load_extension()[0] is not None:
 __all__ = [
     "CapturedStep",
     "Chebyshev",
+    "Cloth",
     "ContactForces",
     "Damping",
     "Embedding",
+    "Fibres",
     "FitReport",
     "FreeFormPatches",
     "Gravity",
@@ -68,14 +75,17 @@ __all__ = [
     "Quadrics",
     "Reactions",
     "RigidPieces",
+    "Rod",
     "Scene",
     "SceneWarning",
     "Simulator",
     "Solid",
     "Sphere",
+    "Springs",
     "State",
     "Stress",
     "TetMesh",
+    "Tie",
     "Track",
     "TriMesh",
     "TuningWarning",

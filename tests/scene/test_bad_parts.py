@@ -30,7 +30,7 @@ def test_effects_are_checked() -> None:
         (lambda: pd.Pin(solid, np.ones(5, bool)), ValueError, r"Pin\.vertices .*got \[5\]"),
         (lambda: pd.Pin(solid, [1], -1.0), ValueError, r"Pin\.stiffness .*got -1\.0"),
         (lambda: pd.Pin(solid, [1], [1.0, 2.0]), ValueError, r"Pin\.stiffness .*got \[2\]"),
-        (lambda: pd.Pin("solid", [1]), TypeError, "Pin: solid .*got str"),
+        (lambda: pd.Pin("solid", [1]), TypeError, r"Pin\.body .*got str"),
         (lambda: pd.Gravity((0.0, 1.0)), ValueError, r"Gravity\.vector .*got \[2\]"),
         (lambda: pd.Gravity((0.0, math.inf, 0.0)), ValueError, r"Gravity\.vector .*got inf"),
         (lambda: pd.Ground(math.nan), ValueError, r"Ground\.height .*got nan"),
@@ -56,7 +56,7 @@ def test_scenes_are_checked() -> None:
         ((solid, solid), ValueError, "got the same Solid twice"),
         ((solid, pd.Gravity(), pd.Gravity()), ValueError, "at most one Gravity, got 2"),
         ((solid, pd.Damping(1.0), pd.Damping(1.0)), ValueError, "at most one Damping, got 2"),
-        ((solid, pd.Pin(other, [0])), ValueError, "the solid of a Pin must be a part of this scene"),
+        ((solid, pd.Pin(other, [0])), ValueError, "the body of a Pin must be a part of this scene"),
         (
             (solid, pd.Pin(solid, [0, 1]), pd.Pin(solid, [1, 2])),
             ValueError,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from inspect import signature
 from typing import Any, ParamSpec, TypeVar
@@ -23,7 +23,11 @@ _VERTICES = "positions are `vertices` [V, 3] in m"
 SYNONYMS: dict[str, dict[str, str]] = {
     "": {
         "Body DeformableBody FEM FEMEntity SoftBody": "an elastic body is `Solid(mesh, youngs=..., density=...)`",
-        "Cloth Membrane Sheet Shell": 'an open sheet is `PatchBody(patches, apex="prism", ...)`',
+        "Garment Membrane Sheet Shell": "a sheet of triangles is `Cloth(surface, youngs=..., thickness=...)`",
+        "Cable Rope Thread": "a line is `Rod(points, youngs=..., radius=...)`",
+        "Spring": "`Springs(body, pairs, stiffness)` joins pairs of vertices",
+        "Attach Sew Weld": "`Tie(body, vertices, other, stiffness=...)` holds vertices to points of another body",
+        "Fiber Fibers Fibre Muscle Muscles": "muscles are `Fibres(solid, direction, stiffness)`",
         "Collider": "bodies collide with `Ground` and `Sphere`",
         "Engine Env Environment Model Sim World": "`Simulator(scene)` steps a `Scene`",
         "Anchor Attachment Constraint Fixed FixedConstraint": "`Pin(solid, vertices)` holds vertices",
@@ -36,8 +40,8 @@ SYNONYMS: dict[str, dict[str, str]] = {
     },
     "Solid": {
         "E modulus young young_modulus youngs_modulus": "Young's modulus is `youngs` [Pa]",
-        "nu poisson poisson_ratio poissons_ratio": "Poisson's ratio is 0 in this energy, and cannot be set",
-        "lam lame la mu stiffness": "the material is Young's modulus `youngs` [Pa], at a Poisson's ratio of 0",
+        "nu poisson_ratio poissons_ratio": "Poisson's ratio is `poisson`",
+        "lam lame la mu stiffness": "the material is Young's modulus `youngs` [Pa] and Poisson's ratio `poisson`",
         "rho": "`density` is in kg/m^3",
         "mass masses": "mass follows from `density` [kg/m^3]; sim.set_material(masses=...) sets that of vertices",
         "damping": "damping is a part of the scene: Scene(solid, Damping(rate))",
@@ -48,7 +52,7 @@ SYNONYMS: dict[str, dict[str, str]] = {
         "idx ids indices indexes nodes points verts": "`vertices` are numbers of vertices, or a mask",
         "k ke kp": "`stiffness` is in N/m, and None holds exactly",
         "position positions target targets": "a step takes targets: sim(state, targets={pin: positions})",
-        "body mesh": "the body is `solid`",
+        "cloth mesh rod": "the body is `body`",
     },
     "Ground": {
         "mu friction_coefficient": _FRICTION,
@@ -131,8 +135,14 @@ class Renamed:
         )
 
 
-def check_arguments(owner: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Decorate a function known to users as `owner`, so that errors about arguments name it and its arguments."""
+def check_arguments(
+    owner: str, *, renamed: Mapping[str, str] | None = None
+) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorate a function known to users as `owner`, so that errors about arguments name it and its arguments.
+
+    `renamed` maps former names of arguments to those of now; they work, with a `DeprecationWarning`.
+    """
+    former = renamed or {}
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         known = [name for name, one in signature(function).parameters.items() if one.kind != one.VAR_POSITIONAL]
@@ -141,8 +151,11 @@ def check_arguments(owner: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
         @wraps(function)
         def checked(*args: P.args, **kwargs: P.kwargs) -> R:
-            for name in kwargs:
-                if name not in known:
+            for name in list(kwargs):
+                if name in former and former[name] not in kwargs:
+                    warn_user(f"{owner}: {name} is now called {former[name]}: use that name", DeprecationWarning)
+                    kwargs[former[name]] = kwargs.pop(name)
+                elif name not in known:
                     ours = ", ".join(name for name in known if name != "self")
                     raise TypeError(f"{owner} has no argument {name!r}; {_answer(owner, name) or f'it takes {ours}'}")
             return function(*args, **kwargs)

@@ -26,10 +26,16 @@ from ..geometry.embedding import Embedding
 from ..geometry.mesh_checks import set_frozen
 from ..geometry.tet_mesh import TetMesh, without_face_checks
 from ..geometry.tri_mesh import TriMesh
+from ..scene.cloth import Cloth
 from ..scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from ..scene.fibres import Fibres
+from ..scene.part import Body
 from ..scene.pins import PIN_HARD
+from ..scene.rod import Rod
 from ..scene.scene import Part, Scene
 from ..scene.solvers import Chebyshev, Jacobi, Multilevel, Solver
+from ..scene.springs import Springs
+from ..scene.tie import Tie
 from ..version import __version__
 
 __all__ = ["FORMAT_VERSION", "SavedSimulation", "load_simulation", "reading", "save_simulation"]
@@ -40,8 +46,11 @@ _FIRST_ARRAYS = (
     "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets", "planes", "spheres",
 )  # fmt: skip
 _KEY = "torchpd"  # of the metadata; others may add their own keys
-_KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in (Solid, Pin, Gravity, Ground, Sphere, Damping)}
+_PARTS = (Solid, Cloth, Rod, Springs, Tie, Fibres, Pin, Gravity, Ground, Sphere, Damping)
+_KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in _PARTS}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
+_BODIES = {"body", "other", "solid"}  # fields that hold a body of the scene
+_LATER = {"poisson", "averaging"}  # fields of a Solid that the first files of format 2 lack
 # inputs of a preconditioner, which with the mesh determine its bits
 _REFERENCE = ("stiffness", "inertia")
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in (torch.float32, torch.float64)}
@@ -139,24 +148,36 @@ def _mesh_arrays(mesh: TetMesh) -> dict[str, NDArray[Any]]:
     return arrays
 
 
+def _fields(part: Part) -> dict[str, Any]:
+    kind = next(kind for kind in _KINDS.values() if isinstance(part, kind))  # a body of patches as the Solid it is
+    return {field.name: getattr(part, field.name) for field in dataclasses.fields(kind)}
+
+
 def _part_arrays(part: Part) -> dict[str, NDArray[Any]]:
-    """The fields of a part that are arrays."""
-    fields = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
-    return {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
+    """The fields of a part that are arrays; those of a surface by its name and theirs."""
+    arrays = {}
+    for name, value in _fields(part).items():
+        if isinstance(value, np.ndarray):
+            arrays[name] = value
+        elif isinstance(value, TriMesh):
+            own = {"vertices": value.vertices, "triangles": value.triangles, "uvs": value.uvs}
+            arrays.update({f"{name}.{key}": array for key, array in own.items() if array is not None})
+    return arrays
 
 
 def _part_record(part: Part, scene: Scene, meshes: list[TetMesh]) -> Record:
-    """The fields of a part that are no arrays: numbers as they are, other parts by number."""
-    kind = next(kind for kind in _KINDS.values() if isinstance(part, kind))  # a body of patches as the Solid it is
-    record: Record = {"kind": kind.__name__}
-    if isinstance(part, Solid):
-        record["mesh"] = next(number for number, mesh in enumerate(meshes) if mesh is part.mesh)
-    elif isinstance(part, Pin):
-        record["solid"] = next(number for number, other in enumerate(scene.parts) if other is part.solid)
-        record["hard"] = part.stiffness is None
-    else:
-        fields = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
-        record.update({name: value for name, value in fields.items() if isinstance(value, float)})
+    """The fields of a part that are no arrays: numbers and None as they are, bodies and meshes by number."""
+    record: Record = {"kind": next(name for name, kind in _KINDS.items() if isinstance(part, kind))}
+    for name, value in _fields(part).items():
+        if isinstance(value, TetMesh):
+            record[name] = next(number for number, mesh in enumerate(meshes) if mesh is value)
+        elif isinstance(value, Body):
+            number = next(number for number, other in enumerate(scene.parts) if other is value)
+            record["solid" if isinstance(part, Pin) else name] = number
+        elif isinstance(part, Pin) and name == "stiffness":
+            record["hard"] = value is None
+        elif value is None or isinstance(value, bool | int | float | str):
+            record[name] = value
     return record
 
 
@@ -266,21 +287,23 @@ def _mesh(number: int, record: Record, tensors: _Tensors) -> TetMesh:
     set_frozen(mesh, flipped=record["flipped"])
     if not tensors.has(f"{prefix}.embedding.tets"):
         return mesh
-    uvs = tensors.array(f"{prefix}.surface.uvs") if tensors.has(f"{prefix}.surface.uvs") else None
-    surface = TriMesh(
-        tensors.array(f"{prefix}.surface.vertices"), tensors.array(f"{prefix}.surface.triangles"), uvs=uvs
-    )
+    surface = _surface(f"{prefix}.surface", tensors)
     tets = tensors.array(f"{prefix}.embedding.tets")
     weights = tensors.array(f"{prefix}.embedding.weights")
     return mesh.with_embedding(Embedding(surface, tets, weights, mesh.tets[tets], len(mesh.vertices)))
 
 
+def _surface(prefix: str, tensors: _Tensors) -> TriMesh:
+    uvs = tensors.array(f"{prefix}.uvs") if tensors.has(f"{prefix}.uvs") else None
+    return TriMesh(tensors.array(f"{prefix}.vertices"), tensors.array(f"{prefix}.triangles"), uvs=uvs)
+
+
 def _parts(records: list[Record], meshes: list[TetMesh], tensors: _Tensors) -> list[Part]:
-    """The parts in their order; a pin may come before its body."""
+    """The parts in their order; a pin or a spring may come before its body."""
     parts: dict[int, Part] = {}
-    for pins in (False, True):
+    for bodies in (True, False):
         for number, record in enumerate(records):
-            if (record["kind"] == "Pin") == pins:
+            if issubclass(_KINDS[record["kind"]], Body) == bodies:
                 parts[number] = _part(number, record, meshes, parts, tensors)
     return [parts[number] for number in range(len(records))]
 
@@ -291,11 +314,17 @@ def _part(number: int, record: Record, meshes: list[TetMesh], parts: Mapping[int
     if kind is Solid:
         fields["mesh"] = meshes[record["mesh"]]
     if kind is Pin:
-        fields["solid"] = parts[record["solid"]]
+        fields["body"] = fields.pop("solid")
+    for name in _BODIES.intersection(fields):
+        fields[name] = parts[fields[name]]
     for field in dataclasses.fields(kind):
-        hard = field.name == "stiffness" and record.get("hard", False)
-        if field.name not in fields and not hard:
-            fields[field.name] = tensors.array(f"part.{number}.{field.name}")
+        if field.name in fields or (field.name == "stiffness" and record.get("hard", False)):
+            continue
+        whole = f"part.{number}.{field.name}"
+        if tensors.has(f"{whole}.triangles"):
+            fields[field.name] = _surface(whole, tensors)
+        elif tensors.has(whole) or field.name not in _LATER:
+            fields[field.name] = tensors.array(whole)
     part: Part = kind(**fields)
     if isinstance(part, Ground):
         # normalising again might change the last bit

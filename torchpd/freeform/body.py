@@ -12,7 +12,8 @@ from torch import Tensor
 from ..common.checks import as_array, check_finite, check_positive, check_scalar, check_shape
 from ..geometry.mesh_checks import set_frozen
 from ..geometry.tet_mesh import without_face_checks
-from ..scene.effects import ArrayLike, Solid
+from ..scene.effects import Solid
+from ..scene.part import ArrayLike
 from .constraints import Constraints, prisms, skeleton
 from .surface import PatchPose, PatchSurface
 from .transport import FrameMode, PatchTransport

@@ -227,10 +227,10 @@ def _enclosed(points: Array, tets: Index) -> float | None:
     return float(np.abs(np.bincount(np.minimum(here, mirrored), weights=signed)).sum())
 
 
-def mesh_components(tets: Index) -> Index:
-    """Component number of each vertex [V]; vertices connected by tets have equal numbers."""
-    count = int(tets.max()) + 1
-    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].reshape(-1)
+def mesh_components(elements: Index) -> Index:
+    """Component number of each vertex [V]; vertices connected by elements [E, corners] have equal numbers."""
+    count = int(elements.max()) + 1
+    rows, columns = np.repeat(elements[:, 0], elements.shape[1] - 1), elements[:, 1:].reshape(-1)
     graph = coo_array((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 

@@ -6,104 +6,52 @@ All quantities are in SI units. Numbers, sequences, arrays and tensors are accep
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import FrozenInstanceError, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..common.checks import as_array, check_finite, check_positive, check_scalar, check_shape, check_vector
-from ..common.reprs import by_fields
-from ..common.synonyms import check_arguments
-from ..geometry.mesh_checks import warn
-from ..geometry.mesh_faces import mesh_components
+from ..common.checks import as_array, check_finite, check_scalar, check_shape, check_vector
+from ..common.synonyms import Renamed, check_arguments
+from ..common.warn import SceneWarning, warn_user
 from ..geometry.tet_mesh import TetMesh
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
+from .averaging import average_over
+from .part import (
+    Array,
+    ArrayLike,
+    Body,
+    Index,
+    KeyPart,
+    ScenePart,
+    check_body,
+    per_item,
+    report_size,
+    selected,
+    set_fields,
+)
 
 __all__ = ["Damping", "Gravity", "Ground", "Pin", "Solid", "Sphere"]
 
-Array = NDArray[np.float64]
-ArrayLike = float | Sequence[float] | Array | torch.Tensor
-
-# Meshes of shorter or longer bodies [m] are probably in other units.
-_SHORTEST, _LONGEST = 1e-3, 50.0
-
-
-def _set(part: object, **values: Any) -> None:
-    """Store checked values in a frozen part."""
-    for name, value in values.items():
-        object.__setattr__(part, name, value)
-
-
-class _Part:
-    """A value that a deep copy shares, so that copies of a scene know the same parts."""
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self
-
-    def __repr__(self) -> str:
-        return by_fields(self)
-
-
-class _Key(_Part):
-    """A part that serves as a key of `targets` and read-outs: frozen, but not by `dataclass(frozen=True)`.
-
-    torch.compile would hash such a dataclass by its fields, which are arrays, despite `eq=False`.
-    """
-
-    def __setattr__(self, name: str, value: object) -> None:
-        raise FrozenInstanceError(f"cannot assign to field {name!r}")
-
-    def __delattr__(self, name: str) -> None:
-        raise FrozenInstanceError(f"cannot delete field {name!r}")
-
-
-def _per_element(name: str, value: ArrayLike, count: int, *, unit: str) -> Array:
-    array = as_array(name, value, np.float64)
-    if array.ndim == 0:
-        array = np.full(count, float(array))
-    check_shape(name, array, (count,), f"one value per tetrahedron or a scalar [{unit}]")
-    check_finite(name, array)
-    check_positive(name, array, unit=unit)
-    array.setflags(write=False)
-    return array
-
-
-def _longest_side(mesh: TetMesh) -> float:
-    """Longest side [m] of the box around a mesh or, if that is too long, of the boxes around its components."""
-    points = mesh.vertices
-    length = float(np.ptp(points, axis=0).max())
-    if length <= _LONGEST:
-        return length
-    component = mesh_components(mesh.tets)
-    order = np.argsort(component, kind="stable")
-    starts = np.flatnonzero(np.diff(component[order], prepend=-1))
-    sides = np.maximum.reduceat(points[order], starts) - np.minimum.reduceat(points[order], starts)
-    return float(sides.max())
-
-
-def _report_size(mesh: TetMesh) -> None:
-    """Warn of a body whose longest side is probably not in metres."""
-    length = _longest_side(mesh)
-    if not _SHORTEST <= length <= _LONGEST:
-        fix = "scaled(1000) if these were divided by 1000"
-        if length > _LONGEST:
-            fix = 'scaled(0.001) if these are millimetres, or read its file with unit="mm"'
-        warn(
-            f"Solid: the mesh is {length:.4g} m long, where bodies of {_SHORTEST:g} to {_LONGEST:g} m are expected. "
-            f"Coordinates are in metres: pass mesh.{fix}"
-        )
+# Contacts and pins act on vertices of partly empty tetrahedra. If these were far softer, they would be squashed flat,
+# and a step would have several solutions.
+_LEAST_RESISTANCE = 0.1
+# Poisson's ratios [low, high) that a solid may have, and above which a step takes many iterations.
+_LOWEST, _HIGHEST, _SLOW = -1.0, 0.495, 0.45
 
 
 @dataclass(eq=False, repr=False)
-class Solid(_Key):
+class Solid(Body):
     """An elastic body of tetrahedra.
 
-    The energy of a tetrahedron is w V / 2 |F - R|^2. F is the deformation gradient, R its nearest rotation, and w
-    Young's modulus at Poisson ratio 0 (Vyatkin and Dolgovesov 2023, where st = w / 2).
+    Without a Poisson's ratio, the energy of a tetrahedron is w V / 2 |F - R|^2. F is the deformation gradient, R its
+    nearest rotation, and w Young's modulus (Vyatkin and Dolgovesov 2023, where st = w / 2).
+
+    With one, it is V (mu |F - R|^2 + lambda t^2 / 2), t = tr(R^T F) - 3 and Lame's constants mu and lambda: the
+    corotated linear law. Where lambda t > 2 mu, the pressure stays at 2 mu, so that a step cannot diverge. Linear
+    tetrahedra are too stiff near nu = 1/2; groups of them share the mean of t, weighted by V lambda.
 
     Tetrahedra that are partly empty (`mesh.fill`, from `tetrahedralize`) have mass and stiffness in proportion. The
     stiffness is at least a tenth of the full one (Nesme et al. 2009, for embedded surfaces).
@@ -113,82 +61,152 @@ class Solid(_Key):
             with `from_file(..., unit="mm")`.
         youngs: Young's modulus [Pa], a scalar or one value per tetrahedron, positive.
         density: [kg/m^3], a scalar or one value per tetrahedron, positive.
+        poisson: Poisson's ratio, a scalar or one value per tetrahedron, above -1 and below 0.495. Above 0.45 a step
+            needs many iterations, and a `SceneWarning` says so. The scalar 0 compiles lambda away.
+        averaging: tetrahedra that share the mean of t: 1, 2 or 4 at most, or the number of a group for each
+            tetrahedron [E]. None: 2 for the lattice of `tetrahedralize`, which hardly locks, and 4 otherwise. Groups
+            of 2 and 4 share faces and have similar bulk moduli.
+
+    Example:
+        >>> rubber = Solid(mesh, youngs=1e6, poisson=0.4, density=1100.0)
     """
 
     mesh: TetMesh
     youngs: Array
     density: Array
+    poisson: Array | float  # [E], or 0.0
+    averaging: int | Index | None
 
     @check_arguments("Solid")
-    def __init__(self, mesh: TetMesh, youngs: ArrayLike, density: ArrayLike = 1000.0) -> None:
+    def __init__(
+        self,
+        mesh: TetMesh,
+        youngs: ArrayLike,
+        density: ArrayLike = 1000.0,
+        *,
+        poisson: ArrayLike = 0.0,
+        averaging: int | Sequence[int] | NDArray[Any] | torch.Tensor | None = None,
+    ) -> None:
         if not isinstance(mesh, TetMesh):
             raise TypeError(
                 f"Solid: mesh must be a TetMesh, got {type(mesh).__name__}; "
                 "turn a surface into tetrahedra with torchpd.tetrahedralize(surface, cells=...)"
             )
-        _report_size(mesh)
+        report_size("Solid", "mesh", mesh.vertices, mesh.tets)
         count = len(mesh.tets)
-        _set(
+        set_fields(
             self,
             mesh=mesh,
-            youngs=_per_element("Solid.youngs", youngs, count, unit="Pa"),
-            density=_per_element("Solid.density", density, count, unit="kg/m^3"),
+            youngs=per_item("Solid.youngs", youngs, count, of="tetrahedron", unit="Pa"),
+            density=per_item("Solid.density", density, count, of="tetrahedron", unit="kg/m^3"),
+            poisson=_poisson(poisson, count),
+            averaging=_averaging(averaging, count),
         )
+
+    @property
+    def elements(self) -> Index:
+        return self.mesh.tets
+
+    @property
+    def stiffness(self) -> Array:
+        """Young's modulus times fill [E] Pa, with a fill of at least 0.1."""
+        return self._filled(self.youngs, _LEAST_RESISTANCE)
+
+    @property
+    def filled_density(self) -> Array:
+        """Density times fill [E] kg/m^3."""
+        return self._filled(self.density, 0.0)
+
+    def masses(self) -> Array:
+        corners = self.mesh.vertices[self.mesh.tets]
+        edges = corners[:, 1:] - corners[:, :1]
+        share = self.filled_density * np.linalg.det(edges) / 24.0
+        count = len(self.mesh.vertices)
+        masses = np.bincount(self.mesh.tets.reshape(-1), weights=np.repeat(share, 4), minlength=count)
+        return masses.astype(np.float64, copy=False)
+
+    @cached_property
+    def averaging_groups(self) -> Index:
+        """Numbers of the groups that share the mean of t [E], from 0."""
+        if isinstance(self.averaging, np.ndarray):
+            return np.unique(self.averaging, return_inverse=True)[1].astype(np.int64).reshape(-1)
+        return average_over(self.mesh, self.stiffness / (3.0 * (1.0 - 2.0 * self.poisson)), self.averaging)
+
+    def _filled(self, values: Array, least: float) -> Array:
+        return values if self.mesh.fill is None else values * np.maximum(self.mesh.fill, least)
+
+
+def _poisson(value: ArrayLike, count: int) -> Array | float:
+    name = "Solid.poisson"
+    array = as_array(name, value, np.float64)
+    if array.ndim == 0 and float(array) == 0.0:
+        return 0.0
+    array = np.full(count, float(array)) if array.ndim == 0 else array
+    check_shape(name, array, (count,), "one value per tetrahedron or a scalar")
+    check_finite(name, array)
+    bad = np.flatnonzero(~((array > _LOWEST) & (array < _HIGHEST)))
+    if bad.size:
+        raise ValueError(
+            f"{name} must lie above {_LOWEST:g} and below {_HIGHEST:g}, got {array[bad[0]]} at {int(bad[0])} "
+            f"({bad.size} in all); take 0.45 for what hardly changes its volume"
+        )
+    if array.max() > _SLOW:
+        warn_user(
+            f"{name} is {array.max():g}: above {_SLOW:g} a step needs several times as many iterations. Take "
+            f"{_SLOW:g}, which changes volumes by a little more, or check the error of your steps",
+            SceneWarning,
+        )
+    return array
+
+
+def _averaging(value: Any, count: int) -> int | Index | None:
+    name = "Solid.averaging"
+    if value is None:
+        return None
+    array = as_array(name, value)
+    if array.dtype.kind not in "iu" or (array.ndim == 0 and int(array) not in (1, 2, 4)):
+        raise ValueError(f"{name} must be 1, 2, 4 or whole numbers of groups [{count}], got {value!r}")
+    if array.ndim == 0:
+        return int(array)
+    check_shape(name, array, (count,), "the number of a group for each tetrahedron")
+    return array.astype(np.int64)
 
 
 @dataclass(eq=False, repr=False)
-class Pin(_Key):
-    """Holds vertices of a solid at their rest positions, or at the `targets` of a step.
+class Pin(KeyPart):
+    """Holds vertices of a body at their rest positions, or at the `targets` of a step.
 
     `Simulator.set_material(pin_hard=...)` releases hard pins, and grasps again.
 
     Args:
-        solid: the body.
+        body: the body: a `Solid`, `Cloth` or `Rod`.
         vertices: vertex numbers of that body [P], or a boolean mask over its vertices.
         stiffness: None holds them exactly (hard); a positive number or [P] is a spring k / 2 |x - target|^2 [N/m].
     """
 
-    solid: Solid
-    vertices: NDArray[np.int64]
+    body: Body
+    vertices: Index
     stiffness: Array | None
 
-    @check_arguments("Pin")
+    solid = Renamed("body")
+
+    @check_arguments("Pin", renamed={"solid": "body"})
     def __init__(
-        self, solid: Solid, vertices: Sequence[int] | NDArray[Any] | torch.Tensor, stiffness: ArrayLike | None = None
+        self, body: Body, vertices: Sequence[int] | NDArray[Any] | torch.Tensor, stiffness: ArrayLike | None = None
     ) -> None:
-        if not isinstance(solid, Solid):
-            raise TypeError(f"Pin: solid must be a Solid of the scene, got {type(solid).__name__}")
-        count = len(solid.mesh.vertices)
-        chosen = as_array("Pin.vertices", vertices)
-        if chosen.dtype == np.bool_:
-            check_shape("Pin.vertices", chosen, (count,), "a mask over the vertices of the body")
-            chosen = np.flatnonzero(chosen)
-        if chosen.size == 0:
-            raise ValueError("Pin.vertices must name at least one vertex, got none")
-        if chosen.ndim != 1 or not np.issubdtype(chosen.dtype, np.integer):
-            raise ValueError(
-                f"Pin.vertices must be integers [P] or a boolean mask [{count}], "
-                f"got {chosen.dtype} {list(chosen.shape)}"
-            )
-        if chosen.min() < 0 or chosen.max() >= count:
-            bad = int(chosen[(chosen < 0) | (chosen >= count)][0])
-            raise IndexError(f"Pin.vertices must lie in 0..{count - 1} (vertices of the body), got {bad}")
-        if len(np.unique(chosen)) != len(chosen):
-            numbers, counts = np.unique(chosen, return_counts=True)
-            raise ValueError(f"Pin.vertices must name each vertex once, got {int(numbers[counts.argmax()])} twice")
+        check_body("Pin.body", body)
+        chosen = selected("Pin.vertices", vertices, len(body.mesh.vertices), of="body")
         springs = None
         if stiffness is not None:
-            springs = as_array("Pin.stiffness", stiffness, np.float64)
-            springs = np.full(len(chosen), float(springs)) if springs.ndim == 0 else springs
-            check_shape("Pin.stiffness", springs, (len(chosen),), "a scalar or one value per pinned vertex [N/m]")
-            check_finite("Pin.stiffness", springs)
-            check_positive("Pin.stiffness", springs, unit="N/m")
-            springs.setflags(write=False)
-        _set(self, solid=solid, vertices=chosen.astype(np.int64), stiffness=springs)
+            springs = per_item("Pin.stiffness", stiffness, len(chosen), of="pinned vertex", unit="N/m")
+        set_fields(self, body=body, vertices=chosen, stiffness=springs)
+
+    def bodies_used(self) -> tuple[Body, ...]:
+        return (self.body,)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Gravity(_Part):
+class Gravity(ScenePart):
     """A uniform acceleration of all bodies.
 
     Args:
@@ -199,11 +217,11 @@ class Gravity(_Part):
 
     @check_arguments("Gravity")
     def __init__(self, vector: ArrayLike = (0.0, -9.81, 0.0)) -> None:
-        _set(self, vector=check_vector("Gravity.vector", vector))
+        set_fields(self, vector=check_vector("Gravity.vector", vector))
 
 
 @dataclass(eq=False, repr=False)
-class Ground(_Key):
+class Ground(KeyPart):
     """A plane that vertices cannot pass: normal . x >= height, with Coulomb friction.
 
     Planes act one after another. In the wedge of two planes that are not at right angles, a vertex ends slightly inside
@@ -228,7 +246,7 @@ class Ground(_Key):
         direction = direction / largest  # so that no length overflows
         direction = direction / np.linalg.norm(direction)
         direction.setflags(write=False)
-        _set(
+        set_fields(
             self,
             height=check_scalar("Ground.height", height),
             normal=direction,
@@ -237,7 +255,7 @@ class Ground(_Key):
 
 
 @dataclass(eq=False, repr=False)
-class Sphere(_Key):
+class Sphere(KeyPart):
     """A sphere that vertices cannot enter, with Coulomb friction; `targets` of a step may move its centre.
 
     Friction drags a body along only if the step gets the centre's velocity too: `targets={sphere: [..., 6]}`. `rollout`
@@ -258,7 +276,7 @@ class Sphere(_Key):
         size = check_scalar("Sphere.radius", radius)
         if size <= 0.0:
             raise ValueError(f"Sphere.radius must be positive [m], got {size}")
-        _set(
+        set_fields(
             self,
             center=check_vector("Sphere.center", center),
             radius=size,
@@ -267,7 +285,7 @@ class Sphere(_Key):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Damping(_Part):
+class Damping(ScenePart):
     """Drag proportional to mass: every velocity decays as dv/dt = -rate v.
 
     It is implicit: the energy rate m / (2 h) |x - x_t|^2 divides a free motion by 1 + rate h in each step.
@@ -280,4 +298,4 @@ class Damping(_Part):
 
     @check_arguments("Damping")
     def __init__(self, rate: float) -> None:
-        _set(self, rate=check_scalar("Damping.rate", rate, minimum=0.0))
+        set_fields(self, rate=check_scalar("Damping.rate", rate, minimum=0.0))

@@ -10,12 +10,19 @@ from numpy.typing import NDArray
 
 from ..common.synonyms import check_arguments
 from ..geometry.mesh_faces import mesh_components
+from .cloth import Cloth
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
+from .fibres import Fibres
+from .part import Body
 from .pins import PinnedComponents
+from .rod import Rod
+from .springs import Springs
+from .stencils import StencilGroup, merge_groups
+from .tie import Tie
 
 __all__ = ["Part", "Scene", "SceneValues"]
 
-Part = Solid | Pin | Gravity | Ground | Sphere | Damping
+Part = Solid | Cloth | Rod | Springs | Tie | Fibres | Pin | Gravity | Ground | Sphere | Damping
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -28,7 +35,7 @@ class SceneValues:
     tets: Index  # [E, 4]
     stiffness: Array  # [E] Young's modulus times fill, Pa, with a fill of at least 0.1
     density: Array  # [E] density times fill, kg/m^3
-    masses: Array  # [V] kg, lumped: density * volume / 4 to each corner
+    masses: Array  # [V] kg, lumped: density * volume / 4 to each corner of a tetrahedron, a third to one of a triangle
     pin_vertices: Index  # [P]
     pin_stiffness: Array  # [P] N/m, inf where the pin is hard
     pin_targets: Array  # [P, 3] m
@@ -39,24 +46,9 @@ class SceneValues:
     component: Index  # [V] number of the connected component of each vertex
     pinned: PinnedComponents  # pinned points of the components
     loose: NDArray[np.bool_]  # [components] whether hard pins leave a component rigid motions
-
-
-# Contacts and pins act on vertices of partly empty tetrahedra. If these were far softer, they would be squashed flat,
-# and a step would have several solutions.
-_LEAST_RESISTANCE = 0.1
-
-
-def _filled(solid: Solid, values: Array, least: float = 0.0) -> Array:
-    """Values per tetrahedron, multiplied by the fill, or by `least` if that is more."""
-    return values if solid.mesh.fill is None else values * np.maximum(solid.mesh.fill, least)
-
-
-def _lumped_masses(positions: Array, tets: Index, density: Array) -> Array:
-    corners = positions[tets]
-    edges = corners[:, 1:] - corners[:, :1]
-    share = density * np.linalg.det(edges) / 24.0
-    masses = np.bincount(tets.reshape(-1), weights=np.repeat(share, 4), minlength=len(positions))
-    return masses.astype(np.float64, copy=False)
+    stencils: tuple[StencilGroup, ...] = ()  # at most one group per kind, in the order of `stencils.KINDS`
+    poisson: Array | None = None  # [E] Poisson's ratio, None where every solid has the scalar 0
+    tet_group: Index | None = None  # [E] numbers of the groups that share a volume strain, None without `poisson`
 
 
 def _no_part(part: object) -> TypeError:
@@ -71,8 +63,9 @@ class Scene:
     `SceneWarning` if they overlap at rest, and once if they overlap after a step with `return_info=True`.
 
     Args:
-        parts: `Solid`, `Pin`, `Gravity`, `Ground`, `Sphere`, `Damping`. At least one `Solid`; at most one `Gravity` and
-            one `Damping`. A `Pin` holds a `Solid` of this scene; no vertex is pinned twice.
+        parts: bodies (`Solid`, `Cloth`, `Rod`), what acts on them (`Pin`, `Springs`, `Tie`, `Fibres`), and `Gravity`,
+            `Ground`, `Sphere`, `Damping`. At least one body; at most one `Gravity` and one `Damping`. A part acts on
+            bodies of this scene; no vertex is pinned twice.
     """
 
     @check_arguments("Scene")
@@ -81,7 +74,7 @@ class Scene:
             if not isinstance(part, Part):
                 raise _no_part(part)
         self.parts: tuple[Part, ...] = parts
-        if not self.solids:
+        if not self.bodies:
             raise ValueError("Scene needs at least one body, got none; add Solid(mesh, youngs=1e5, density=1000.0)")
         if len({id(part) for part in parts}) != len(parts):
             twice = next(part for number, part in enumerate(parts) if any(part is one for one in parts[:number]))
@@ -89,10 +82,11 @@ class Scene:
         for kind in (Gravity, Damping):
             if len(self._all(kind)) > 1:
                 raise ValueError(f"Scene takes at most one {kind.__name__}, got {len(self._all(kind))}")
-        solids = {id(solid) for solid in self.solids}
-        for pin in self.pins:
-            if id(pin.solid) not in solids:
-                raise ValueError("Scene: the solid of a Pin must be a part of this scene, got another one; pass both")
+        bodies = {id(body) for body in self.bodies}
+        for part in parts:
+            if any(id(body) not in bodies for body in part.bodies_used()):
+                words = f"the body of a {type(part).__name__} must be a part of this scene"
+                raise ValueError(f"Scene: {words}, got another one; pass both")
         numbers, counts = np.unique(self._pinned(), return_counts=True)
         if (counts > 1).any():
             raise ValueError(f"Scene: pins must hold different vertices, got two at {int(numbers[counts.argmax()])}")
@@ -103,11 +97,16 @@ class Scene:
 
     def _pinned(self) -> Index:
         """Numbers of the pinned vertices among those of all bodies [P]."""
-        pinned = [self.vertex_range(pin.solid).start + pin.vertices for pin in self.pins]
+        pinned = [self.vertex_range(pin.body).start + pin.vertices for pin in self.pins]
         return np.concatenate([np.zeros(0, dtype=np.int64), *pinned])
 
     def _all(self, kind: type) -> tuple[Any, ...]:
         return tuple(part for part in self.parts if isinstance(part, kind))
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """All parts with vertices, in the order in which they were given, which is that of the vertices."""
+        return self._all(Body)
 
     @property
     def solids(self) -> tuple[Solid, ...]:
@@ -125,14 +124,26 @@ class Scene:
     def spheres(self) -> tuple[Sphere, ...]:
         return self._all(Sphere)
 
-    def vertex_range(self, solid: Solid) -> slice:
+    def vertex_range(self, body: Body) -> slice:
         """Slice of a body's vertices in positions [B, V, 3]."""
         start = 0
-        for other in self.solids:
-            if other is solid:
+        for other in self.bodies:
+            if other is body:
                 return slice(start, start + len(other.mesh.vertices))
             start += len(other.mesh.vertices)
-        raise ValueError("Scene.vertex_range: solid must be a part of the scene, got another one")
+        raise ValueError("Scene.vertex_range: body must be a part of the scene, got another one")
+
+    def stencil_ranges(self, part: Part) -> dict[str, slice]:
+        """Slices of a part's stencils in the groups of `values().stencils`, by kind."""
+        counts: dict[str, int] = {}
+        for other in self.parts:
+            before = dict(counts)
+            for group in other.stencils(lambda body: 0):
+                counts[group.kind] = counts.get(group.kind, 0) + len(group)
+            if other is part:
+                kinds = [kind for kind in counts if counts[kind] > before.get(kind, 0)]
+                return {kind: slice(before.get(kind, 0), counts[kind]) for kind in kinds}
+        raise ValueError("Scene.stencil_ranges: part must be a part of the scene, got another one")
 
     def pin_range(self, pin: Pin) -> slice:
         """Slice of a pin's targets in pin_targets [P, 3]."""
@@ -145,21 +156,23 @@ class Scene:
 
     def values(self) -> SceneValues:
         """The flat arrays of the scene, in the user's order."""
-        positions = np.concatenate([solid.mesh.vertices for solid in self.solids])
-        starts = [self.vertex_range(solid).start for solid in self.solids]
-        tets = np.concatenate([s.mesh.tets + start for s, start in zip(self.solids, starts, strict=True)])
-        density = np.concatenate([_filled(solid, solid.density) for solid in self.solids])
+        starts = {id(body): self.vertex_range(body).start for body in self.bodies}
+        positions = np.concatenate([body.mesh.vertices for body in self.bodies])
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
-        masses, component = _lumped_masses(positions, tets, density), mesh_components(tets)
+        masses, component = np.concatenate([body.masses() for body in self.bodies]), self._components()
         pinned = PinnedComponents.of(positions, masses, component, pin_vertices)
         gravity, damping = self._all(Gravity), self._all(Damping)
+        none = np.zeros(0)
+        poisson, tet_group = self._poisson()
         return SceneValues(
             rest_positions=positions,
-            tets=tets,
-            stiffness=np.concatenate([_filled(solid, solid.youngs, _LEAST_RESISTANCE) for solid in self.solids]),
-            density=density,
+            tets=np.concatenate(
+                [np.zeros((0, 4), dtype=np.int64), *(solid.mesh.tets + starts[id(solid)] for solid in self.solids)]
+            ),
+            stiffness=np.concatenate([none, *(solid.stiffness for solid in self.solids)]),
+            density=np.concatenate([none, *(solid.filled_density for solid in self.solids)]),
             masses=masses,
             pin_vertices=pin_vertices,
             pin_stiffness=stiffness,
@@ -171,7 +184,31 @@ class Scene:
             component=component,
             pinned=pinned,
             loose=pinned.loose(np.isinf(stiffness)),
+            stencils=merge_groups(
+                group for part in self.parts for group in part.stencils(lambda body: starts[id(body)])
+            ),
+            poisson=poisson,
+            tet_group=tet_group,
         )
+
+    def _components(self) -> Index:
+        """Number of the connected component of each vertex [V]; springs and ties join none."""
+        parts, count = [], 0
+        for body in self.bodies:
+            parts.append(mesh_components(body.elements) + count)
+            count = int(parts[-1].max()) + 1
+        return np.concatenate(parts)
+
+    def _poisson(self) -> tuple[Array | None, Index | None]:
+        """Poisson's ratios of all tetrahedra and their groups, or None if every solid has the scalar 0."""
+        if all(isinstance(solid.poisson, float) for solid in self.solids):
+            return None, None
+        ratios, groups, count = [], [], 0
+        for solid in self.solids:
+            ratios.append(np.broadcast_to(solid.poisson, len(solid.mesh.tets)))
+            groups.append(solid.averaging_groups + count)
+            count = int(groups[-1].max()) + 1
+        return np.concatenate(ratios), np.concatenate(groups)
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(type(part).__name__ for part in self.parts)})"

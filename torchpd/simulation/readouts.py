@@ -36,7 +36,8 @@ from ..common.tables import PLANES, SPHERES
 from ..ops.adjoint import AdjointCall, step_gradient
 from ..ops.diagonal import named_material, pinned_vertices, step_diagonal
 from ..plan.material import MATERIAL_ROWS
-from ..scene.effects import Ground, Pin, Solid, Sphere
+from ..scene.effects import Ground, Pin, Sphere
+from ..scene.part import Body
 from ..scene.scene import Scene
 
 __all__ = [
@@ -72,7 +73,7 @@ class ContactForce(NamedTuple):
     friction: Tensor  # [B, V, 3] N, its tangential part
     push: Tensor  # [B, V] N, magnitude of its normal part
     touches: Tensor  # [B, V] bool, whether it is active
-    bodies: dict[Solid, Wrench]  # sum and torque on each body
+    bodies: dict[Body, Wrench]  # sum and torque on each body
 
     def __repr__(self) -> str:
         return by_sizes(self, self.force, "batch", "vertices")
@@ -83,7 +84,7 @@ class ContactForces(NamedTuple):
 
     force: Tensor  # [B, V, 3] N, of all colliders together, on the vertices
     residual: Tensor  # [B, V, 3] N, the part that neither contacts nor pins balance; zero at a solved step
-    bodies: dict[Solid, Wrench]  # sum and torque of all colliders on each body
+    bodies: dict[Body, Wrench]  # sum and torque of all colliders on each body
     colliders: dict[Ground | Sphere, ContactForce]  # empty without colliders
 
     def __repr__(self) -> str:
@@ -133,14 +134,14 @@ class _Body(NamedTuple):
     about: Tensor  # [B, 3] m
 
 
-def _bodies(scene: Scene, positions: Tensor, masses: Tensor, about: Tensor | None) -> dict[Solid, _Body]:
-    found: dict[Solid, _Body] = {}
+def _bodies(scene: Scene, positions: Tensor, masses: Tensor, about: Tensor | None) -> dict[Body, _Body]:
+    found: dict[Body, _Body] = {}
     point = None if about is None else _checked_point(about, positions)
-    for solid in scene.solids:
-        rows = scene.vertex_range(solid)
+    for body in scene.bodies:
+        rows = scene.vertex_range(body)
         own, weights = positions[:, rows], masses[..., rows, None]
         center = _tree_sum(weights * own) / _tree_sum(weights) if point is None else point
-        found[solid] = _Body(rows, own, center)
+        found[body] = _Body(rows, own, center)
     return found
 
 
@@ -193,7 +194,7 @@ def reactions(scene: Scene, call: AdjointCall, about: Tensor | None) -> Reaction
     for pin in scene.pins:
         rows = scene.pin_range(pin)
         own = forces[:, rows]
-        pins[pin] = PinForce(own, _wrench(own, call.after[:, vertices[rows]], bodies[pin.solid].about))
+        pins[pin] = PinForce(own, _wrench(own, call.after[:, vertices[rows]], bodies[pin.body].about))
     return Reactions(forces, on_vertices, pins)
 
 
@@ -331,5 +332,5 @@ def contact_forces(scene: Scene, call: AdjointCall, about: Tensor | None) -> Con
     return ContactForces(total, force - total, _on_bodies(total, bodies), found)
 
 
-def _on_bodies(forces: Tensor, bodies: dict[Solid, _Body]) -> dict[Solid, Wrench]:
+def _on_bodies(forces: Tensor, bodies: dict[Body, _Body]) -> dict[Body, Wrench]:
     return {solid: _wrench(forces[..., body.rows, :], body.positions, body.about) for solid, body in bodies.items()}
