@@ -24,6 +24,7 @@ from torch import Tensor
 from ..baselines.contact_newton import ContactNewton
 from ..common.checks import expand_shared
 from ..common.tables import PLANES, SPHERES
+from ..ops.diagonal import named_material
 from ..plan.material import MATERIAL_ROWS
 from ..reference.problem import StepProblem, step_problem
 from ..scene.effects import Ground, Sphere
@@ -155,7 +156,7 @@ def problem_of(
     arrays = sim.material_at(targets, state[0].shape[0])
     forces = expand_shared(forces, state[0].shape)
     material = {}
-    for name, array in zip(MATERIAL_ROWS, arrays, strict=True):
+    for name, array in named_material(arrays).items():
         shared = array.dim() == MATERIAL_ROWS[name].dims
         material[name] = _double(array if shared else array[item if len(array) > 1 else 0])
     planes, spheres = material["planes"], material["spheres"]

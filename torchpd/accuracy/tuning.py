@@ -26,8 +26,8 @@ from ..common.tables import PLANES
 from ..common.warn import TuningWarning, warn_user
 from ..estimate.convergence import has_friction
 from ..estimate.solver_choice import runs
-from ..ops.diagonal import step_diagonal
-from ..plan.material import MATERIAL_ROWS, dims_of, fingerprint, named_arrays
+from ..ops.diagonal import named_material, step_diagonal
+from ..plan.material import dims_of, fingerprint, named_arrays
 from ..scene.pins import PIN_HARD
 from ..scene.solvers import Chebyshev, Multilevel, Solver
 from ..scene.targets import Targets
@@ -176,7 +176,7 @@ def _with_targets(sim: Stepper, targets: Targets | None, batch: int) -> Stepper:
     """The simulator with pins and spheres at `targets`."""
     if targets is None:
         return sim
-    places = dict(zip(MATERIAL_ROWS, sim.material_at(targets, batch), strict=True))
+    places = named_material(sim.material_at(targets, batch))
     placed = plain_copy(sim)
     placed.set_material(**{name: places[name].detach() for name in ("pin_targets", "spheres")})
     return placed

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from ..common.checks import check_like
-from ..ops.diagonal import step_diagonal
-from ..plan.material import MATERIAL_ROWS, environments_of_material, named_arrays
+from ..ops.diagonal import named_material, step_diagonal
+from ..plan.material import environments_of_material, named_arrays
 from ..simulation.state import State
 from .error import ExactStep
 
@@ -49,7 +49,7 @@ def check_start(sim: Stepper, state: State, forces: Tensor | None) -> None:
         if len(bad):
             raise ValueError(f"tune: state.{name} must be finite, got NaN or infinity in environment {int(bad[0])}")
     values = {"forces": forces} if forces is not None else {}
-    for name, array in (values | dict(zip(MATERIAL_ROWS, sim.material(), strict=True))).items():
+    for name, array in (values | named_material(sim.material())).items():
         # hard pins have infinite springs
         bad = (array.isnan() if name == "pin_stiffness" else ~array.isfinite()).nonzero()
         if len(bad):

@@ -9,12 +9,16 @@ from .. import _C
 __all__ = [
     "DEVICE_PLAN_TABLE",
     "DEVICE_SIZES",
+    "EFFECT_ROWS",
+    "KINDS",
     "MATERIAL_TABLE",
     "MULTILEVEL_TABLE",
     "PLANES",
     "PLAN_TABLE",
     "SETTINGS_TABLE",
     "SPHERES",
+    "STENCIL_TABLE",
+    "Kind",
     "MaterialRow",
     "PlanRow",
     "SettingRow",
@@ -22,7 +26,7 @@ __all__ = [
 
 
 class PlanRow(NamedTuple):
-    """A row of csrc/views/cpu_plan.def, multilevel.def or gpu_plan.def: a constant array."""
+    """A row of csrc/views/cpu_plan.def, cpu_stencils.def, multilevel.def or gpu_plan.def: a constant array."""
 
     name: str
     type: str
@@ -38,11 +42,23 @@ class MaterialRow(NamedTuple):
     width: int
     rows: str
     meaning: str
+    effect: bool  # whether only some scenes have it
 
     @property
     def dims(self) -> int:
         """Number of dimensions without a batch."""
         return (self.rows != "one") + (self.width > 1)
+
+
+class Kind(NamedTuple):
+    """A row of csrc/elements/kinds.def: a kind of stencils."""
+
+    name: str
+    corners: int  # n
+    columns: int  # d, columns of F
+    constants: int  # further constants of a stencil
+    rows: tuple[str, ...]  # names of its arrays in the material
+    meaning: str
 
 
 class SettingRow(NamedTuple):
@@ -63,8 +79,12 @@ def _columns(array: str) -> dict[str, Any]:
 
 PLAN_TABLE = tuple(PlanRow(*row) for row in _C.plan_table())
 MULTILEVEL_TABLE = tuple(PlanRow(*row) for row in _C.multilevel_table())
+STENCIL_TABLE = tuple(PlanRow(*row) for row in _C.stencil_table())
 DEVICE_PLAN_TABLE = tuple(PlanRow(*row) for row in _C.device_plan_table())
 MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
+# arrays of the material that only some scenes have; they follow the others
+EFFECT_ROWS = tuple(row for row in MATERIAL_TABLE if row.effect)
+KINDS = {row.name: row for row in (Kind(*row) for row in _C.kind_table())}
 SETTINGS_TABLE = tuple(SettingRow(*row) for row in _C.settings_table())
 # columns of the material arrays
 PLANES, SPHERES = (_columns(array) for array in ("planes", "spheres"))

@@ -13,14 +13,19 @@ __all__ = ["elastic_material", "named_material", "pinned_vertices", "step_diagon
 
 
 def named_material(arrays: Sequence[Tensor]) -> dict[str, Tensor]:
-    """Material arrays by name."""
-    return {row.name: array for row, array in zip(MATERIAL_TABLE, arrays, strict=True)}
+    """Material arrays by name: those of every scene, or all of the table."""
+    rows = MATERIAL_TABLE[: len(arrays)]
+    return {row.name: array for row, array in zip(rows, arrays, strict=True)}
 
 
-def elastic_material(stiffness: Tensor) -> list[Tensor]:
-    """Material for the ops of the elastic energy, which read and keep the stiffness alone."""
+def elastic_material(material: Sequence[Tensor]) -> list[Tensor]:
+    """Material for the ops of the elastic energy, which read and keep the stiffness and the effects alone."""
+    stiffness = named_material(material)["stiffness"]
     unread = torch.empty(0, dtype=stiffness.dtype, device=stiffness.device)
-    return [stiffness if row.name == "stiffness" else unread for row in MATERIAL_TABLE]
+    rows = MATERIAL_TABLE[: len(material)]
+    return [
+        array if row.effect or row.name == "stiffness" else unread for row, array in zip(rows, material, strict=True)
+    ]
 
 
 def pinned_vertices(plan: Sequence[Tensor]) -> Tensor:

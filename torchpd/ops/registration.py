@@ -11,7 +11,14 @@ from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
 from .. import _C
-from ..common.tables import MATERIAL_TABLE
+from ..common.tables import (
+    EFFECT_ROWS,
+    MATERIAL_TABLE,
+    MULTILEVEL_TABLE,
+    PLAN_TABLE,
+    STENCIL_TABLE,
+    MaterialRow,
+)
 from .adjoint import adjoint_fallback
 from .diagonal import named_material
 from .vmap import register_rule
@@ -23,6 +30,8 @@ INFO_WIDTH = _C.info_numbers
 
 _ops = torch.ops.torchpd
 _STIFFNESS = [row.name for row in MATERIAL_TABLE].index("stiffness")
+_STENCIL_PLAN = len(PLAN_TABLE) + len(STENCIL_TABLE)
+_CORE = len(MATERIAL_TABLE) - len(EFFECT_ROWS)  # arrays that every scene has
 
 
 def nearest_rotation(F: Tensor) -> Tensor:
@@ -125,10 +134,21 @@ def _(positions: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Se
     return positions.new_empty((positions.shape[0], material[_STIFFNESS].shape[-1]))
 
 
+@_register_fake("effect_energy")
+def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty(positions.shape[:1])
+
+
+@_register_fake("effect_products")
+def _(positions: Tensor, direction: Tensor | None, material: Sequence[Tensor], plan: Sequence[Tensor]) -> list[Tensor]:
+    return [positions.new_empty((len(positions), array.shape[-1])) for array in material[_CORE:]]
+
+
 @_register_fake("elastic_diagonal")
 def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, weighted: bool) -> Tensor:
     stiffness, (_, vertex_order, *_) = material[_STIFFNESS], plan
-    return stiffness.new_empty((*stiffness.shape[:-1], vertex_order.shape[0]))
+    own = [len(array) for row, array in _elastic_rows(material) if array.dim() > row.dims]
+    return stiffness.new_empty((*own[:1], vertex_order.shape[0]))
 
 
 @_register_fake("precondition")
@@ -140,11 +160,11 @@ def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
 def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     _, _, _, positions, _, _, material, _ = step
     batch, vertices, _ = positions.shape
-    rows = list(zip(MATERIAL_TABLE, material, strict=True))
+    rows = list(zip(MATERIAL_TABLE[: len(material)], material, strict=True))
     touching = any(row.name in ("planes", "spheres") and array.shape[-2] > 0 for row, array in rows)
     # arrays that inertia and diagonal depend on
     own = touching or any(
-        row.name in ("stiffness", "masses", "damping", "pin_stiffness")
+        (row.effect or row.name in ("stiffness", "masses", "damping", "pin_stiffness"))
         and array.dim() > row.dims
         and len(array) != 1
         and array.shape[1:].numel() > 0
@@ -239,9 +259,52 @@ def _with_stiffness(material: Sequence[Tensor], stiffness: Tensor) -> list[Tenso
     return [stiffness if place == _STIFFNESS else array for place, array in enumerate(material)]
 
 
-def _for_material(stiffness: Tensor | None) -> list[Tensor | None]:
-    """Gradients of the material rows: only stiffness enters the elastic energy."""
-    return [stiffness if row.name == "stiffness" else None for row in MATERIAL_TABLE]
+def _elastic_rows(material: Sequence[Tensor]) -> list[tuple[MaterialRow, Tensor]]:
+    """Arrays of the material that the elastic energy depends on, with their rows of the table."""
+    rows = MATERIAL_TABLE[: len(material)]
+    pairs = zip(rows, material, strict=True)
+    return [(row, array) for row, array in pairs if row.name == "stiffness" or row.effect]
+
+
+def _for_material(
+    material: Sequence[Tensor], stiffness: Tensor | None, effects: Sequence[Tensor | None] | None = None
+) -> list[Tensor | None]:
+    """Gradients of the material: stiffness and effects enter the elastic energy."""
+    count = len(material) - _CORE
+    grads: list[Tensor | None] = [stiffness if place == _STIFFNESS else None for place in range(_CORE)]
+    return [*grads, *([None] * count if effects is None else effects)]
+
+
+def _sum_to_rows(material: Sequence[Tensor], each: Sequence[Tensor]) -> list[Tensor | None]:
+    """Gradients of the effects from those of every environment."""
+    shared = zip(MATERIAL_TABLE[_CORE:], material[_CORE:], each, strict=True)
+    return [
+        None if array.numel() == 0 else grad.sum(0) if array.dim() == row.dims else grad.sum_to_size(array.shape)
+        for row, array, grad in shared
+    ]
+
+
+def _effect_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
+    positions, *material = ctx.saved_tensors
+    x, effects = None, None
+    if ctx.needs_input_grad[0]:
+        alone = _with_stiffness(material, torch.zeros_like(material[_STIFFNESS]))
+        x = grad[:, None, None] * _ops.gradient(positions, alone, ctx.plan)
+    if any(ctx.needs_input_grad[1][_CORE:]):
+        products = _ops.effect_products(positions, None, material, ctx.plan)
+        effects = _sum_to_rows(material, [grad[:, None] * product for product in products])
+    return x, _for_material(material, None, effects), _for_plan(ctx)
+
+
+def _tets_alone(material: Sequence[Tensor], stiffness: Tensor) -> list[Tensor]:
+    """The material with another stiffness, for a plan without stencils."""
+    return _with_stiffness(material, stiffness)[:_CORE]
+
+
+def _without_stencils(plan: Sequence[Tensor]) -> list[Tensor]:
+    """The arrays of a plan without those of its stencils and of its preconditioner, on a CPU."""
+    stencils = len(plan) in (_STENCIL_PLAN, _STENCIL_PLAN + len(MULTILEVEL_TABLE))
+    return list(plan[: len(PLAN_TABLE)]) if stencils else list(plan)
 
 
 def _for_plan(ctx: Any) -> list[None]:
@@ -253,22 +316,24 @@ def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, lis
     positions, *material = ctx.saved_tensors
     stiffness, x, w = material[_STIFFNESS], None, None
     if ctx.needs_input_grad[0]:
-        x = _ops.gradient(positions, _with_stiffness(material, grad * stiffness), ctx.plan)
+        x = _ops.gradient(positions, _tets_alone(material, grad * stiffness), _without_stencils(ctx.plan))
     if ctx.needs_input_grad[1][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
         w = _sum_to_stiffness(grad * _ops.element_energy(positions, unit, ctx.plan), stiffness)
-    return x, _for_material(w), _for_plan(ctx)
+    return x, _for_material(material, w), _for_plan(ctx)
 
 
 def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
     positions, *material = ctx.saved_tensors
-    stiffness, x, w = material[_STIFFNESS], None, None
+    stiffness, x, w, effects = material[_STIFFNESS], None, None, None
     if ctx.needs_input_grad[0]:
         x = _ops.hessian_product(positions, grad, material, ctx.plan)
     if ctx.needs_input_grad[1][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
         w = _sum_to_stiffness(_ops.element_energy_product(positions, grad, unit, ctx.plan), stiffness)
-    return x, _for_material(w), _for_plan(ctx)
+    if any(ctx.needs_input_grad[1][_CORE:]):
+        effects = _sum_to_rows(material, _ops.effect_products(positions, grad, material, ctx.plan))
+    return x, _for_material(material, w, effects), _for_plan(ctx)
 
 
 def _element_energy_product_backward(
@@ -276,37 +341,38 @@ def _element_energy_product_backward(
 ) -> tuple[Tensor | None, Tensor | None, list[Tensor | None], list[None]]:
     positions, direction, *material = ctx.saved_tensors
     stiffness, x, d, w = material[_STIFFNESS], None, None, None
-    scaled = _with_stiffness(material, grad * stiffness)
+    scaled, plan = _tets_alone(material, grad * stiffness), _without_stencils(ctx.plan)
     if ctx.needs_input_grad[0]:
-        x = _ops.hessian_product(positions, direction, scaled, ctx.plan)
+        x = _ops.hessian_product(positions, direction, scaled, plan)
     if ctx.needs_input_grad[1]:
-        d = _ops.gradient(positions, scaled, ctx.plan)
+        d = _ops.gradient(positions, scaled, plan)
     if ctx.needs_input_grad[2][_STIFFNESS]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
         w = _sum_to_stiffness(grad * _ops.element_energy_product(positions, direction, unit, ctx.plan), stiffness)
-    return x, d, _for_material(w), _for_plan(ctx)
+    return x, d, _for_material(material, w), _for_plan(ctx)
 
 
 def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | None, list[Tensor | None], list[None]]:
-    if ctx.needs_input_grad[0] or ctx.needs_input_grad[2][_STIFFNESS]:
+    wanted = ctx.needs_input_grad[2]
+    if ctx.needs_input_grad[0] or wanted[_STIFFNESS] or any(wanted[_CORE:]):
         raise RuntimeError(
             "torchpd: third derivatives of the elastic energy are not provided; detach positions and stiffness before "
             "differentiating a Hessian-vector product"
         )
     positions, _, *material = ctx.saved_tensors
     d = _ops.hessian_product(positions, grad, material, ctx.plan) if ctx.needs_input_grad[1] else None
-    return None, d, _for_material(None), _for_plan(ctx)
+    return None, d, _for_material(material, None), _for_plan(ctx)
 
 
 def _save_nothing(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
     """Nothing to save."""
 
 
-def _diagonal_backward(ctx: Any, grad: Tensor) -> tuple[list[Tensor | None], list[None]]:
+def _diagonal_backward(ctx: Any, grad: Tensor) -> tuple[list[None], list[None]]:
     wanted, of_plan = ctx.needs_input_grad
-    if wanted[_STIFFNESS]:
+    if wanted[_STIFFNESS] or any(wanted[_CORE:]):
         raise RuntimeError("torchpd: the elastic diagonal, a preconditioner, has no derivative; detach stiffness")
-    return _for_material(None), [None] * len(of_plan)
+    return [None] * len(wanted), [None] * len(of_plan)
 
 
 def _precondition_setup(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
@@ -361,6 +427,7 @@ torch.library.register_autograd("torchpd::precondition", _precondition_backward,
 
 for _name, _backward, _setup in (
     ("element_energy", _element_energy_backward, _save_elastic),
+    ("effect_energy", _effect_energy_backward, _save_elastic),
     ("gradient", _gradient_backward, _save_elastic),
     ("element_energy_product", _element_energy_product_backward, _save_elastic),
     ("hessian_product", _hessian_product_backward, _save_elastic),

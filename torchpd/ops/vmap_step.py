@@ -16,6 +16,12 @@ __all__ = ["rollout_vjp_rule", "step_vjp_rule"]
 
 _ops = torch.ops.torchpd
 _OWN = {row.name: row.dims for row in MATERIAL_TABLE}  # dimensions of an array without a batch
+_ELASTIC = tuple(row.name for row in MATERIAL_TABLE if row.effect or row.name == "stiffness")
+
+
+def _named(material: Sequence[Any]) -> dict[str, Any]:
+    """Arrays of a material, or their mapped dimensions, by name: those of every scene, or all."""
+    return dict(zip(list(_OWN)[: len(material)], material, strict=True))
 
 
 def _shape_of_one(tensor: Tensor, dim: int | None) -> torch.Size:
@@ -68,9 +74,8 @@ def _join_all(
     *state, material, plan = args
     *state_dims, material_dims, plan_dims = in_dims
     _check_plan(plan_dims)
-    arrays = {
-        name: (array, dim) for name, array, dim in zip(_OWN, material, material_dims, strict=True) if name in read
-    }
+    mapped = _named(material_dims)
+    arrays = {name: (array, mapped[name]) for name, array in _named(material).items() if name in read}
     shapes = [_shape_of_one(t, d) for t, d in zip(state, state_dims, strict=True) if t is not None]
     of_steps = shapes[:tracks]
     shapes = shapes[tracks:]
@@ -89,7 +94,7 @@ def _join_all(
         for t, d in zip(state[tracks:], state_dims[tracks:], strict=True)
     ]
     values = {name: _join(t, d, size, batch, _OWN[name]) for name, (t, d) in arrays.items()}
-    return [*joined, [values.get(name, t) for name, t in zip(_OWN, material, strict=True)], plan], (size, batch)
+    return [*joined, [values.get(name, t) for name, t in _named(material).items()], plan], (size, batch)
 
 
 def _batch_rule(name: str, dim: int = 0, read: Iterable[str] = _OWN) -> Rule:
@@ -118,13 +123,12 @@ def _vjp_rule(
 ) -> tuple[list[Tensor], int]:
     (*state, values, plan), maps = _join_all(op, info, in_dims, args, tracks, **numbers)
     each = [
-        t.expand(maps[0] * maps[1], *t.shape[t.dim() - own :]).contiguous()
-        for t, own in zip(values, _OWN.values(), strict=True)
+        t.expand(maps[0] * maps[1], *t.shape[t.dim() - _OWN[name] :]).contiguous() for name, t in _named(values).items()
     ]
     grads = [t.unflatten(0, maps) for t in op(*state, each, plan, **numbers)]
     shapes = [_shape_of_one(t, d) for t, d in zip(args[-2], in_dims[-2], strict=True)]
     asked = [True] * len(shapes) if numbers.get("wanted") is None else numbers["wanted"]
-    rows = [(shape, own) for shape, own, wanted in zip(shapes, _OWN.values(), asked, strict=True) if wanted]
+    rows = [(shape, _OWN[name]) for (name, shape), wanted in zip(_named(shapes).items(), asked, strict=True) if wanted]
     summed = [
         grad.sum(1, keepdim=len(shape) > own) if len(shape) == own or shape[0] < maps[1] else grad
         for grad, (shape, own) in zip(grads[3:], rows, strict=True)
@@ -167,7 +171,9 @@ def _rotation_rule(name: str) -> Rule:
     return rule
 
 
-for _name in ("gradient", "hessian_product", "element_energy", "element_energy_product"):
+for _name in ("gradient", "hessian_product", "effect_energy"):
+    register_rule(_name, _batch_rule(_name, read=_ELASTIC))
+for _name in ("element_energy", "element_energy_product"):
     register_rule(_name, _batch_rule(_name, read=("stiffness",)))
 register_rule("step", _batch_rule("step"))
 register_rule("rollout", _batch_rule("rollout", 1))

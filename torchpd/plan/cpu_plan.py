@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from .. import _C
 from ..common.checks import tensor_of
-from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, PLAN_TABLE, PlanRow
+from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, KINDS, PLAN_TABLE, STENCIL_TABLE, PlanRow
 from ..scene.scene import SceneValues
 
 __all__ = [
@@ -145,7 +145,7 @@ def _advance(bar: tqdm[Any], done: float) -> None:
 
 
 def _patch_size(tets: int) -> int:
-    """Tetrahedra per patch: small enough for the cache, in a patch count that two or four threads share evenly.
+    """Elements per patch: small enough for the cache, in a patch count that two or four threads share evenly.
 
     Larger patches share fewer vertices: 1.6 slots per vertex at 1024 tetrahedra, 1.4 at 2048.
     """
@@ -204,18 +204,20 @@ def compile_plan(
     Args:
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
-        patch_size: tetrahedra per patch, 16 to 8192; None chooses by mesh size.
+        patch_size: elements per patch, 16 to 4096; None chooses by mesh size.
         progress: show a bar when the mesh is large.
     """
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
     tets = len(values.tets)
-    with compile_progress(tets, progress) as advance:
+    elements = tets + sum(len(group) for group in values.stencils)
+    stencils = [
+        (list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants)
+        for group in values.stencils
+    ]
+    with compile_progress(elements, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_plan(
-            values.rest_positions,
-            values.tets,
-            patch_size or _patch_size(tets),
-            advance,
+            values.rest_positions, values.tets, stencils, patch_size or _patch_size(elements), advance
         )
     internal = internal_numbers(arrays["vertex_order"])
     group, component_size = loose_pieces(values)
@@ -223,5 +225,7 @@ def compile_plan(
     arrays["component_size"] = component_size
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
     arrays["sizes"] = _sizes(arrays, tets)
-    tensors = (tensor_of(arrays[row.name]) for row in PLAN_TABLE)
-    return Plan(tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors), loose=values.loose)
+    table = PLAN_TABLE + STENCIL_TABLE if stencils else PLAN_TABLE
+    tensors = (tensor_of(arrays[row.name]) for row in table)
+    reals = tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors)
+    return Plan(reals, table=table, loose=values.loose)

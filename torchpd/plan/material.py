@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ..common.tables import MATERIAL_TABLE, PLANES, SPHERES
@@ -14,7 +15,7 @@ from ..scene.pins import PIN_HARD, hold_exactly, split_springs
 from ..scene.scene import SceneValues
 
 __all__ = [
-    "ARRAYS",
+    "CORE_ROWS",
     "MATERIAL_ROWS",
     "SCENE_NAME_HINTS",
     "check_array",
@@ -23,6 +24,7 @@ __all__ = [
     "check_material",
     "check_pin_hard",
     "dims_of",
+    "effect_rows",
     "environments_of_material",
     "expand_rows",
     "fingerprint",
@@ -30,16 +32,22 @@ __all__ = [
     "material_rows",
     "named_arrays",
     "real_tensor",
+    "with_absent",
 ]
 
 MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
-ARRAYS = (*MATERIAL_ROWS, PIN_HARD)  # arrays that `set_material` replaces
+CORE_ROWS = tuple(row.name for row in MATERIAL_TABLE if not row.effect)  # arrays that every scene has
 # hints for names of scene arguments given to `set_material`
 SCENE_NAME_HINTS = {
     "density": "masses holds the mass of each vertex [kg], density times its share of the volume",
     "youngs": "stiffness holds Young's modulus of each tetrahedron [Pa]",
 }
 
+_POSITIVE = ("stiffness", "masses", "membrane_youngs", "thickness")
+_NOT_NEGATIVE = (
+    "bending", "rest_curvature", "spring_stiffness", "rest_length", "tie_stiffness", "fibre_stiffness", "fibre_length",
+    "thread_stiffness",
+)  # fmt: skip
 _UNIT_SLACK = 1e-4  # tolerance on the length of a plane normal: float32 rounding, and that of a training step
 
 
@@ -48,9 +56,9 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
     at_rest = MATERIAL_ROWS["spheres"].width - values.spheres.shape[1]
     spheres = np.pad(values.spheres, ((0, 0), (0, at_rest)))
     material = {
-        name: torch.tensor(spheres if name == "spheres" else getattr(values, name), dtype=dtype)
-        for name in MATERIAL_ROWS
+        name: torch.tensor(spheres if name == "spheres" else getattr(values, name), dtype=dtype) for name in CORE_ROWS
     }
+    material |= {name: torch.tensor(row, dtype=dtype) for name, row in effect_rows(values).items()}
     soft = torch.isfinite(torch.from_numpy(values.pin_stiffness.copy()))
     if not bool(torch.isfinite(material["pin_stiffness"])[soft].all()):
         raise ValueError(
@@ -62,6 +70,14 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
     return material
 
 
+def effect_rows(values: SceneValues) -> dict[str, NDArray[np.float64]]:
+    """Arrays of a scene that only some scenes have, in the order of the table."""
+    found = {} if values.poisson is None else {"poisson": values.poisson}
+    for group in values.stencils:
+        found |= group.material
+    return {row.name: found[row.name] for row in MATERIAL_TABLE if row.name in found}
+
+
 def dims_of(name: str) -> int:
     """Number of dimensions of an array without a batch."""
     return 1 if name == PIN_HARD else MATERIAL_ROWS[name].dims
@@ -69,13 +85,23 @@ def dims_of(name: str) -> int:
 
 def named_arrays(sim: nn.Module) -> dict[str, Tensor]:
     """Material arrays of a simulator by name: the trainable ones and the mask of hard pins."""
-    return {name: getattr(sim, name) for name in ARRAYS}
+    names: tuple[str, ...] = sim.material_names
+    return {name: getattr(sim, name) for name in (*names, PIN_HARD)}
 
 
 def material_rows(arrays: Mapping[str, Tensor]) -> list[Tensor]:
     """Rows of the material in the order of the ops, from the arrays by name."""
     held = {"pin_stiffness": hold_exactly(arrays["pin_stiffness"], arrays[PIN_HARD])}
-    return [held.get(name, arrays[name]) for name in MATERIAL_ROWS]
+    return with_absent([held.get(name, array) for name, array in arrays.items() if name != PIN_HARD], arrays)
+
+
+def with_absent(arrays: list[Tensor], names: Iterable[str]) -> list[Tensor]:
+    """The material of the ops: an effect that the scene lacks is an empty array, if the scene has another one."""
+    by_name = dict(zip((name for name in names if name != PIN_HARD), arrays, strict=True))
+    if len(by_name) == len(CORE_ROWS):
+        return arrays
+    unread = torch.empty(0, dtype=arrays[0].dtype, device=arrays[0].device)
+    return [by_name.get(name, unread) for name in MATERIAL_ROWS]
 
 
 def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:
@@ -94,8 +120,14 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
         _require(tensor >= 0, full, ">= 0, inf for pins that hold exactly,", tensor)
         return
     _require(tensor.isfinite(), full, "finite", tensor)
-    if name in ("stiffness", "masses"):
+    if name in _POSITIVE:
         _require(tensor > 0, full, "positive", tensor)
+    elif name in _NOT_NEGATIVE:
+        _require(tensor >= 0, full, ">= 0", tensor)
+    elif name == "membrane_poisson":
+        _require((tensor > -1) & (tensor <= 0.5), full, "in (-1, 0.5]", tensor)
+    elif name == "poisson":
+        _require((tensor > -1) & (tensor < 0.495), full, "in (-1, 0.495)", tensor)
     elif name == "damping":
         _require(tensor >= 0, full, ">= 0", tensor)
     elif name == "planes":
@@ -183,7 +215,7 @@ def fingerprint(arrays: Iterable[Tensor]) -> str:
 def check_batches(owner: str, new: Mapping[str, Tensor], kept: Mapping[str, Tensor]) -> None:
     """Refuse arrays with different numbers of environments; an array without a batch, or with 1, suits any number."""
     first: tuple[int, str] | None = None
-    for name in ARRAYS:
+    for name in kept:
         array, stays = new.get(name, kept[name]), "" if name in new else " (kept)"
         count = len(array) if array.dim() > dims_of(name) else 1
         if count == 0:

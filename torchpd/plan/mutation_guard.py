@@ -52,7 +52,7 @@ def check_rest(guard: MutationGuard, positions: Tensor, scene: Scene) -> Mutatio
     readable = positions.device.type == "cpu" and has_values(positions) and plain_tensor(positions) is positions
     if not readable or positions.is_inference():
         return guard
-    own = np.concatenate([solid.mesh.vertices for solid in scene.solids])
+    own = np.concatenate([body.mesh.vertices for body in scene.bodies])
     if not torch.equal(positions, torch.tensor(own, dtype=positions.dtype, device="cpu")):
         raise ValueError(
             "rest_positions must be those of the scene, whose rest shape is compiled, but they were changed: "

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .. import _C
 from ..common.checks import tensor_of
-from ..common.tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE
+from ..common.tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE, STENCIL_TABLE
 from ..ops.diagonal import named_material, step_diagonal
 from ..scene.scene import SceneValues
 from .cpu_plan import Plan, compile_progress
@@ -39,7 +39,11 @@ ReferenceMaterial = tuple[
 
 def has_preconditioner(plan: Sequence[Tensor]) -> bool:
     """Whether the arrays of a CPU or GPU plan include a multilevel preconditioner."""
-    return len(plan) - len(MULTILEVEL_TABLE) in (len(PLAN_TABLE), len(DEVICE_PLAN_TABLE))
+    return len(plan) - len(MULTILEVEL_TABLE) in (
+        len(PLAN_TABLE),
+        len(PLAN_TABLE + STENCIL_TABLE),
+        len(DEVICE_PLAN_TABLE),
+    )
 
 
 def stored_reference(plan: Sequence[Tensor]) -> ReferenceMaterial:

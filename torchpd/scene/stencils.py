@@ -8,35 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["KINDS", "Kind", "StencilGroup", "merge_groups"]
+from ..common.tables import KINDS
+
+__all__ = ["KINDS", "StencilGroup", "merge_groups"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-
-
-class Kind(NamedTuple):
-    """Sizes of a kind, and the names of its material rows."""
-
-    corners: int  # n
-    columns: int  # d, columns of F
-    constants: int  # c, further constants of a stencil
-    rows: tuple[str, ...]
-
-
-# In the order in which a scene lists them.
-KINDS: dict[str, Kind] = {
-    "triangle": Kind(3, 2, 0, ("membrane_youngs", "membrane_poisson", "thickness")),
-    "hinge": Kind(4, 1, 0, ("bending", "rest_curvature")),
-    "spring": Kind(2, 1, 0, ("spring_stiffness", "rest_length")),
-    "tie": Kind(5, 1, 0, ("tie_stiffness",)),
-    "fibre": Kind(4, 1, 1, ("fibre_stiffness", "fibre_length")),
-    "thread": Kind(3, 1, 0, ("thread_stiffness",)),
-}
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,12 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from ..common.checks import check_has_values
-from ..common.tables import PLANES, SPHERES
+from ..common.tables import EFFECT_ROWS, PLANES, SPHERES
 from ..common.warn import warn_user
 from ..ops.diagonal import named_material
 from ..plan.compiled import CompiledScene, persistent_tensors
 from ..plan.cpu_plan import Plan
 from ..plan.material import (
-    ARRAYS,
     MATERIAL_ROWS,
     SCENE_NAME_HINTS,
     check_array,
@@ -45,7 +44,9 @@ __all__ = [
 ]
 
 # arrays that the convergence rate of a step depends on
-_RATE_ARRAYS = ("stiffness", "masses", "damping", "pin_stiffness", PIN_HARD)
+_RATE_ARRAYS = (
+    "stiffness", "masses", "damping", "pin_stiffness", PIN_HARD, *(row.name for row in EFFECT_ROWS)
+)  # fmt: skip
 # columns by name: the arrays that have one, and its place there
 COLUMNS = {
     "friction": {"planes": PLANES["friction"], "spheres": SPHERES["friction"]},
@@ -72,7 +73,7 @@ class MaterialChange(NamedTuple):
     @property
     def changes_rate(self) -> bool:
         """Whether the change may alter the convergence rate of a step."""
-        return any(name in self.arrays for name in _RATE_ARRAYS)
+        return any(name in _RATE_ARRAYS for name in self.arrays)
 
 
 def check_change(
@@ -80,12 +81,11 @@ def check_change(
 ) -> MaterialChange:
     """Check the arrays of `set_material` or of a state_dict; `assign`: make new parameters, write none in place."""
     check_has_values(owner, compiled.device)
-    for name in arrays:
-        if name not in ARRAYS and name not in COLUMNS:
-            names = ", ".join([*ARRAYS, *COLUMNS])
-            part_of = f"; {SCENE_NAME_HINTS[name]}" if name in SCENE_NAME_HINTS else ""
-            raise TypeError(f"{owner}: no array {name!r}; there are {names}{part_of}")
     own = named_arrays(sim)
+    for name in arrays:
+        if name not in own and name not in COLUMNS:
+            names = ", ".join([*own, *COLUMNS])
+            raise TypeError(f"{owner}: no array {name!r}; there are {names}{_hint(name)}")
     arrays = _expand_columns(own, owner, arrays)
     replaces_hard, hard = PIN_HARD in arrays, arrays.pop(PIN_HARD, False)
     checked = {name: check_array(owner, name, value, own[name]) for name, value in arrays.items()}
@@ -115,6 +115,15 @@ def check_change(
         }
         new_trainable = [name for name, tensor in replaced.items() if name in reshaped and tensor.requires_grad]
         return MaterialChange(checked, originals, replaced, _updated_plan(compiled, own, checked), new_trainable)
+
+
+def _hint(name: str) -> str:
+    """What to do instead of setting an array that a scene lacks."""
+    if name == "poisson":
+        return "; every solid has poisson=0.0, which leaves it out: give Solid(poisson=) another number or an array"
+    if name in MATERIAL_ROWS:
+        return f"; the scene has no {MATERIAL_ROWS[name].rows}"
+    return f"; {SCENE_NAME_HINTS[name]}" if name in SCENE_NAME_HINTS else ""
 
 
 def write_change(sim: nn.Module, change: MaterialChange) -> None:
@@ -264,7 +273,7 @@ def load_material(
     local_metadata, *_, errors = rest
     assign = bool(local_metadata.get("assign_to_params_buffers", False))
     owner = f"{type(sim).__name__}.load_state_dict"
-    arrays = {n: state_dict[prefix + n] for n in ARRAYS if prefix + n in state_dict}
+    arrays = {n: state_dict[prefix + n] for n in named_arrays(sim) if prefix + n in state_dict}
     # former files mark hard pins by inf in pin_stiffness
     older, original = PIN_HARD not in arrays, f"{prefix}parametrizations.pin_stiffness.original"
     try:

@@ -12,10 +12,11 @@ from torch import Tensor, nn
 from ..common.checks import check_whole
 from ..common.synonyms import check_arguments
 from ..estimate.solver_choice import Choice
+from ..ops.diagonal import named_material
 from ..plan.compiled import persistent_tensors
 from ..plan.cpu_plan import Plan, compile_plan
 from ..plan.kernel_choice import check_kernel
-from ..plan.material import MATERIAL_ROWS, material_of
+from ..plan.material import CORE_ROWS, material_of, with_absent
 from ..plan.mutation_guard import MutationGuard, check_rest
 from ..plan.placement import check_target_device, is_recording
 from ..scene.pins import PIN_HARD, hold_exactly
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Model"]
 
-_PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
+_PIN_STIFFNESS = CORE_ROWS.index("pin_stiffness")
 
 
 class _TuningResult(Protocol):
@@ -83,6 +84,7 @@ class Model(nn.Module):
     pin_targets: Tensor
     planes: Tensor
     spheres: Tensor
+    material_names: tuple[str, ...]  # trainable arrays of the scene, in the order of the table
     progress: bool = True  # whether bars show while a large scene compiles, for another device too
 
     @check_arguments("Simulator")
@@ -127,9 +129,11 @@ class Model(nn.Module):
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
             arrays = material_of(values, dtype)
-            for name in MATERIAL_ROWS:
-                self.register_parameter(name, nn.Parameter(arrays[name], requires_grad=False))
-            self.register_buffer(PIN_HARD, arrays[PIN_HARD])
+            hard = arrays.pop(PIN_HARD)
+            self.material_names = tuple(arrays)
+            for name, array in arrays.items():
+                self.register_parameter(name, nn.Parameter(array, requires_grad=False))
+            self.register_buffer(PIN_HARD, hard)
         self._refresh_pin_mask()
         warn_of_overlaps(scene)
         if device is not None:  # first, since "auto" chooses for it
@@ -278,11 +282,15 @@ class Model(nn.Module):
 
         Springs of hard pins are inf here. The plan follows when `pin_hard` releases pins.
         """
-        arrays = [getattr(self, name) for name in MATERIAL_ROWS]
+        arrays = self._own_arrays()
         if self.anchors.pinned:
             arrays[_PIN_STIFFNESS] = self._held_springs(arrays)
         # is_contiguous() is far cheaper than contiguous(), which takes 6 of the 40 us of a tiny step
         return [array if array.is_contiguous() else array.contiguous() for array in arrays]
+
+    def _own_arrays(self) -> list[Tensor]:
+        arrays = [getattr(self, name) for name in self.material_names]
+        return arrays if len(arrays) == len(CORE_ROWS) else with_absent(arrays, self.material_names)
 
     def _held_springs(self, arrays: list[Tensor]) -> Tensor:
         hard = self._buffers[PIN_HARD]  # nn.Module.__getattr__ would double the time of this method
@@ -312,7 +320,7 @@ class Model(nn.Module):
         self._pin_guard = MutationGuard()
         if self.anchors.pinned:
             with persistent_tensors():
-                self._read_pin_mask([getattr(self, name) for name in MATERIAL_ROWS], self.pin_hard, wait=True)
+                self._read_pin_mask(self._own_arrays(), self.pin_hard, wait=True)
 
     def __copy__(self) -> Self:
         """A shallow copy; torch refuses to copy parametrized modules through pickling."""
@@ -424,7 +432,7 @@ class Model(nn.Module):
             targets, self.pin_targets, self.spheres, batch=batch, time_step=self.time_step, fix=fix
         )
         replaced = {"pin_targets": pins, "spheres": spheres}
-        return [replaced.get(row, array).contiguous() for row, array in zip(MATERIAL_ROWS, material, strict=True)]
+        return [replaced.get(row, array).contiguous() for row, array in named_material(material).items()]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         wanted = check_target_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))

@@ -16,14 +16,14 @@ from torch import Tensor, nn
 from ..common.tables import PLANES, SPHERES
 from ..common.warn import SceneWarning, warn_user
 from ..geometry.overlaps import Overlap, boxes_meet, find_overlaps
-from ..plan.material import MATERIAL_ROWS
+from ..plan.material import CORE_ROWS
 from ..scene.scene import Scene
 from .state import State
 
 __all__ = ["Notices", "warn_of_overlaps"]
 
 _ROUNDINGS = 10.0  # machine epsilons of a position that a contact may be violated by
-_PLANES, _SPHERES, _GRAVITY = (list(MATERIAL_ROWS).index(name) for name in ("planes", "spheres", "gravity"))
+_PLANES, _SPHERES, _GRAVITY = (CORE_ROWS.index(name) for name in ("planes", "spheres", "gravity"))
 _ALONE = "bodies do not collide with each other: move them apart, or separate them by Ground and Sphere"
 
 

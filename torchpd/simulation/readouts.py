@@ -35,7 +35,7 @@ from ..common.small_matrices import dot, inverse, length, product
 from ..common.tables import PLANES, SPHERES
 from ..ops.adjoint import AdjointCall, step_gradient
 from ..ops.diagonal import named_material, pinned_vertices, step_diagonal
-from ..plan.material import MATERIAL_ROWS
+from ..plan.material import CORE_ROWS
 from ..scene.effects import Ground, Pin, Sphere
 from ..scene.part import Body
 from ..scene.scene import Scene
@@ -52,7 +52,7 @@ __all__ = [
 
 _SPANNED = 1e-6  # Gram determinant from which normals count as independent, as in csrc/contact/plane_sphere.h
 _FASTEST = 4.0  # bound of relaxation times acceleration, both below 2
-_PIN_STIFFNESS = list(MATERIAL_ROWS).index("pin_stiffness")
+_PIN_STIFFNESS = CORE_ROWS.index("pin_stiffness")
 
 
 class Wrench(NamedTuple):

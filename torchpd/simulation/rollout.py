@@ -12,7 +12,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from ..common.checks import STEPS_DIFFER
-from ..plan.material import MATERIAL_ROWS
+from ..plan.material import CORE_ROWS
 from ..scene.targets import Anchors, Targets
 from .state import Info, State, Track
 
@@ -20,7 +20,7 @@ __all__ = ["PerStep", "Rollout", "run_rollout"]
 
 PerStep = Callable[[int], Any]
 _CHUNK_SECONDS = 0.1
-_SPHERES = list(MATERIAL_ROWS).index("spheres")
+_SPHERES = CORE_ROWS.index("spheres")
 
 
 class Steps(Protocol):

@@ -10,9 +10,9 @@ from torch import Tensor
 from ..common.checks import check_like, check_whole
 from ..common.synonyms import check_arguments
 from ..ops.adjoint import step_gradient
-from ..ops.diagonal import elastic_material
+from ..ops.diagonal import elastic_material, named_material
 from ..ops.registration import INFO_WIDTH, refuse_forward_mode
-from ..plan.material import MATERIAL_ROWS, environments_of_material, named_arrays
+from ..plan.material import CORE_ROWS, environments_of_material, named_arrays
 from ..scene.targets import Targets
 from .readable import Readable
 from .rollout import PerStep, Rollout, run_rollout
@@ -235,10 +235,10 @@ class Stepper(Readable):
         positions = self.positions_of(state)
         refuse_forward_mode(positions)
         arrays = self.material_at(targets, positions.shape[0])
-        material = dict(zip(MATERIAL_ROWS, arrays, strict=True))
-        energy = cast(
-            Tensor, _ops.element_energy(positions, elastic_material(material["stiffness"]), list(self.plan.arrays))
-        ).sum(-1)
+        material, elastic, plan = named_material(arrays), elastic_material(arrays), list(self.plan.arrays)
+        energy = cast(Tensor, _ops.element_energy(positions, elastic, plan)).sum(-1)
+        if len(arrays) > len(CORE_ROWS):
+            energy = energy + _ops.effect_energy(positions, elastic, plan)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
         energy = energy - (material["masses"] * weight).sum(-1)
         if len(self.plan.pin_vertex):
@@ -259,7 +259,7 @@ class Stepper(Readable):
             positions: [B, V, 3], or a `State`.
         """
         positions = self.positions_of(positions, "positions")
-        result: Tensor = _ops.gradient(positions, elastic_material(self.stiffness.contiguous()), list(self.plan.arrays))
+        result: Tensor = _ops.gradient(positions, elastic_material(self.material()), list(self.plan.arrays))
         return result
 
     def step_gradient(
