@@ -256,9 +256,9 @@ Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighte
   call.field = Field::diagonal;
   call.weighted = weighted;
   const Tensor w = stiffness_of(material, call.plan.tets);
-  const std::int64_t own = environments_of(material);
-  const bool batched = own > 0;
-  call.batch = batched ? own : 1;
+  const std::optional<std::int64_t> own = environments_of(material);
+  const bool batched = own.has_value();
+  call.batch = own.value_or(1);
   const EffectArrays<T> effects(call.plan, material, call.batch, place);
   call.effects = effects.view;
   const Tensor out = batched ? at::empty({call.batch, call.plan.vertices}, w.options())

@@ -11,6 +11,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -430,14 +431,16 @@ struct EffectArrays {
   }
 };
 
-// Environments of the elastic material; 0 where all share it.
-inline std::int64_t environments_of(at::TensorList material) {
-  std::int64_t own = array_of(material, "stiffness").dim() == 2 ? material[0].size(0) : 0;
+// Environments of the elastic material; none where all share it.
+inline std::optional<std::int64_t> environments_of(at::TensorList material) {
+  std::optional<std::int64_t> own;
+  const auto raise = [&](std::int64_t count) { own = std::max(own.value_or(0), count); };
+  if (array_of(material, "stiffness").dim() == 2) raise(material[0].size(0));
   std::size_t at = material_arrays;
 #define X(name, width, rows, meaning)
 #define EFFECT(name, width, rows, meaning)                                                     \
   if (at < material.size() && material[at].dim() == (width > 1 ? 3 : 2))                       \
-    own = std::max(own, material[at].size(0));                                                 \
+    raise(material[at].size(0));                                                               \
   ++at;
 #include "views/material.def"
 #undef X

@@ -176,6 +176,18 @@ struct Material {
   Effects<T> effects;
 };
 
+// Whether all environments have the same elastic material.
+template <class T>
+bool shares_elasticity(const Material<T>& material) {
+  bool shared = material.stiffness.stride == 0;
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning) \
+  shared = shared && material.effects.name.stride == 0;
+#include "views/material.def"
+#undef X
+  return shared;
+}
+
 // from lbfgs on, the solver is multilevel
 enum class ScheduleKind : int {
   jacobi = 0,

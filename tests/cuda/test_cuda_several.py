@@ -29,7 +29,7 @@ def unlike(sim: pd.Simulator, count: int) -> tuple[pd.State, Tensor, dict[str, T
     rest = sim.rest_state(count)
     state = pd.State(rest.positions + 0.01 * noise(rest.positions, 1), noise(rest.positions, 2))
     material = {}
-    for number, (name, array) in enumerate(zip(MATERIAL_ROWS, sim.material(), strict=True)):
+    for number, (name, array) in enumerate(named_material(sim.material()).items()):
         own = array.detach().expand(count, *array.shape).clone()
         if name in ("planes", "spheres"):  # height; centre, and how far it moves in a step
             for moving in [own[..., 3:4]] if name == "planes" else [own[..., :3], own[..., 5:8]]:

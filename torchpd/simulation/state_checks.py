@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.checks import check_like, check_whole, expand_shared, to_full_precision
@@ -30,6 +31,7 @@ __all__ = [
 
 
 ADJOINTS = ("solver", "multilevel")  # preconditioners of the adjoint of a step
+_WITH_EDGES = ("triangle", "spring")  # kinds whose corners span an element
 _COARSEST = 1e-4  # largest spacing of float32 positions, in shortest edges, without a warning
 _LONGEST_STEP = {torch.float32: 1e12, torch.float64: 1e100}  # s
 
@@ -47,25 +49,35 @@ def check_batch(batch: int | None) -> int | None:
     return None if batch is None else check_whole("batch", batch, minimum=1)
 
 
+def _shortest_edges(positions: NDArray[np.float64], corners: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Shortest edge of each element [N] m."""
+    points = [positions[corners[:, a]] for a in range(corners.shape[1])]
+    edges = (one - other for one, other in combinations(points, 2))
+    return np.asarray(np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges))))
+
+
 def report_resolution(values: SceneValues, dtype: torch.dtype) -> None:
-    """Warn of tets so far from the origin that float32 spacing exceeds 1e-4 of their shortest edge.
+    """Warn of elements so far from the origin that float32 spacing exceeds 1e-4 of their shortest edge.
 
     Rest shapes are compiled in float64, so rounded positions have strains of that size, which push a body at rest.
     """
     if dtype != torch.float32:
         return
-    corners = [values.rest_positions[values.tets[:, a]] for a in range(4)]
-    edges = (one - other for one, other in combinations(corners, 2))
-    shortest = np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges)))
-    farthest = np.abs(values.rest_positions).max(axis=1)[values.tets].max(axis=1)
+    kinds = [values.tets, *(group.corners for group in values.stencils if group.kind in _WITH_EDGES)]
+    shortest = np.concatenate([_shortest_edges(values.rest_positions, corners) for corners in kinds])
+    reach = np.abs(values.rest_positions).max(axis=1)
+    farthest = np.concatenate([reach[corners].max(axis=1) for corners in kinds])
+    farthest, shortest = farthest[shortest > 0.0], shortest[shortest > 0.0]  # springs may have no length
+    if not len(shortest):
+        return
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows has no resolution
         steps = np.nan_to_num(np.spacing(farthest.astype(np.float32)) / shortest, nan=np.inf)
     worst = int(steps.argmax())
     if steps[worst] > _COARSEST:
         warn_user(
             f"Simulator: {farthest[worst]:.4g} m from the origin float32 resolves positions to "
-            f"{steps[worst] * shortest[worst]:.2g} m, {steps[worst]:.2g} of the shortest edge of a tet there "
-            f"({int((steps > _COARSEST).sum())} of {len(steps)} tets have more than {_COARSEST:g}), so bodies at rest "
+            f"{steps[worst] * shortest[worst]:.2g} m, {steps[worst]:.2g} of the shortest edge of an element "
+            f"there ({int((steps > _COARSEST).sum())} of {len(steps)} have more than {_COARSEST:g}), so bodies at rest "
             "will move. Move the scene to the origin with mesh.translated(...), or pass dtype=torch.float64"
         )
 

@@ -31,18 +31,6 @@ struct ComponentSums {
   bool tips, still;  // in some environment
 };
 
-// Whether all environments have the same elastic material.
-template <class T>
-bool shares_elasticity(const Material<T>& material) {
-  bool shared = material.stiffness.stride == 0;
-#define X(name, width, rows, meaning)
-#define EFFECT(name, width, rows, meaning) \
-  shared = shared && material.effects.name.stride == 0;
-#include "views/material.def"
-#undef X
-  return shared;
-}
-
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers
 
 template <class Lanes>
