@@ -41,23 +41,22 @@ KINDS: dict[str, Kind] = {
 
 @dataclass(frozen=True, eq=False)
 class StencilGroup:
-    """Stencils of one kind.
+    """Stencils of one kind, with what their F, V and psi are.
 
-    | kind | F | V | psi |
-    |---|---|---|---|
-    | triangle | deformation gradient from the rest plane | rest area [m^2] | membrane, Y = youngs thickness |
-    | hinge | curvature vector [1/m] | area of both triangles [m^2], or length of a rod [m] | kb/2 (abs(F) - k0)^2 |
-    | spring | x1 - x0 [m] | 1 | k/2 (abs(F) - L)^2 |
-    | tie | x0 - sum b_a x_a [m] | 1 | k/2 abs(F)^2 |
-    | fibre | F f of its tetrahedron | volume, without empty parts [m^3] | w/2 (abs(F) - L)^2 |
-    | thread | F f of its triangle | rest area [m^2] | w/2 (abs(F) - 1)^2 |
+    - triangle: F maps its rest plane, V is its area [m^2]; the corotated membrane of Y = youngs thickness.
+    - hinge: F is a curvature vector [1/m]; V is the area of two triangles [m^2], or of a rod a length [m]. psi is
+      kb/2 (|F| - k0)^2.
+    - spring: F is x1 - x0 [m], V is 1; k/2 (|F| - L)^2.
+    - tie: F is x0 - sum b_a x_a [m], V is 1; k/2 |F|^2.
+    - fibre: F is that of its tetrahedron times f, V the volume of its material [m^3]; w/2 (|F| - L)^2.
+    - thread: F is that of its triangle times f, V the area [m^2]; w/2 (|F| - 1)^2.
     """
 
     kind: str
     corners: Index  # [N, n] vertices of the scene; one with g_a = 0 may repeat another
     gradients: Array  # [N, n, d] g_a; the rows of a stencil add up to zero
     measure: Array  # [N] V
-    constants: Array  # [N, c]; of a fibre: 1 if it has no energy for abs(F) < L, else 0
+    constants: Array  # [N, c]; of a fibre: 1 if it has no energy for |F| < L, else 0
     material: dict[str, Array]  # trainable rows by name, [N] or [N, width]
 
     def __len__(self) -> int:
