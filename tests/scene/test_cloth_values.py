@@ -56,6 +56,17 @@ def test_hinge_of_the_unit_square() -> None:
         assert bending_energy(group, folded) == pytest.approx(3.0 * energy, rel=EXACT)
 
 
+def test_hinges_of_uneven_triangles_are_flat_in_any_plane() -> None:
+    """c holds for linear functions, so that sum c_a x_a = 0 in a plane, by UVs as well."""
+    mesh = surface(size=(1.0, 1.0), cells=(4, 4))
+    moved = mesh.vertices + 0.08 * np.random.default_rng(5).uniform(-1.0, 1.0, mesh.vertices.shape) * [1.0, 0.0, 1.0]
+    uneven = pd.TriMesh(moved, mesh.triangles)
+    for body in (cloth(uneven), cloth(mesh, rest_uv=moved[:, [0, 2]][mesh.triangles])):
+        group = group_of("hinge", body)
+        assert len(group) == 40
+        assert np.abs(deformation(group, moved @ np.linalg.qr(np.ones((3, 3)) + np.eye(3))[0])).max() < 1e-10
+
+
 def test_a_cylinder_costs_its_curvature_squared() -> None:
     """Equal diagonals, bent along the rows: kb / 2 kappa^2 an area, to the order of the angle of a cell squared.
 

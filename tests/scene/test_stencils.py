@@ -60,6 +60,15 @@ def test_uneven_segments_are_straight_at_rest() -> None:
     assert bending_energy(group_of("hinge", open_), circle) == pytest.approx(1.5, rel=0.01)
 
 
+def test_an_uneven_bend_counts_the_mean_of_its_segments() -> None:
+    """Segments of 1 and 3 m at a right angle: kappa = 2 |t1 - t0| / 4 with unit t, times the length of 2 m."""
+    rod = pd.Rod([[0, 0, 0], [1, 0, 0], [4, 0, 0]], 1e6, 0.01, bending=5.0)
+    bent = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 3.0, 0.0]])
+    assert bending_energy(group_of("hinge", rod), bent) == pytest.approx(5.0 / 2.0 * 0.5 * 2.0, rel=EXACT)
+    soft = pd.Rod(rod.polyline, [1e6, 2e6], 0.01)
+    assert soft.flexural_rigidity() == pytest.approx([1.75e6 * np.pi * 1e-8 / 4.0], rel=EXACT)  # by length
+
+
 def test_ropes_and_single_segments_have_no_hinges() -> None:
     rope = pd.Rod(straight().polyline, youngs=1e6, radius=0.01, bending=0.0)
     for rod in (rope, straight(2)):
