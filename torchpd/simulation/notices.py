@@ -112,8 +112,9 @@ class Notices:
     def _look_for_overlaps(self, scene: Scene, positions: Tensor) -> None:
         """Check the first environment in which boxes overlap; at the 1st, 2nd, 4th, 8th ... such report."""
         ranges = [scene.vertex_range(solid) for solid in scene.solids]
-        starts, corners = [part.start for part in ranges], positions.numpy()
-        lows, highs = (end.reduceat(corners, starts, axis=1) for end in (np.minimum, np.maximum))  # [B, bodies, 3]
+        corners = positions.numpy()
+        # [B, bodies, 3]
+        lows, highs = (np.stack([end(corners[:, r], axis=1) for r in ranges], axis=1) for end in (np.min, np.max))
         meet = boxes_meet(lows, highs)
         if not meet.any():
             return
@@ -135,7 +136,7 @@ class Notices:
             return None
         if self._owner is None or self._owner() is not owner or self._scene is None:
             return None
-        vertices = sum(len(solid.mesh.vertices) for solid in self._scene.solids)
+        vertices = sum(len(body.mesh.vertices) for body in self._scene.bodies)
         return self._scene if positions.shape[1:] == (vertices, 3) and len(positions) else None
 
 
