@@ -163,8 +163,9 @@ def problem_of(
     planes[:, PLANES["friction"]] = 0.0
     spheres[:, SPHERES["friction"]] = 0.0
     motion = SPHERES["motion"]
+    values = sim.scene.values()
     values = dataclasses.replace(
-        sim.scene.values(),
+        values,
         stiffness=material["stiffness"],
         masses=material["masses"],
         gravity=material["gravity"],
@@ -173,6 +174,11 @@ def problem_of(
         planes=planes,
         spheres=spheres[:, : motion.start],
         damping=float(material["damping"]),
+        poisson=None if values.poisson is None else material["poisson"],
+        stencils=tuple(
+            dataclasses.replace(group, material={name: material[name] for name in group.material})
+            for group in values.stencils
+        ),
     )
     return step_problem(
         values,
@@ -220,7 +226,7 @@ def exact_steps(
         sim: scene, time step and material; its solver and device do not matter. float32 needs less certainty.
         state: start of the steps [B, V, 3].
         forces: [B, V, 3] N.
-        targets: of pins and spheres, as in `Simulator.forward`.
+        targets: as in `Simulator.forward`.
         start: u_0 of the errors: "velocity", h v, or the "inertial" first iterate.
         iterations: most of each solver.
     """

@@ -173,12 +173,13 @@ def _default_candidates(sim: Stepper, solvers: Mapping[str, Solver]) -> dict[str
 
 
 def _with_targets(sim: Stepper, targets: Targets | None, batch: int) -> Stepper:
-    """The simulator with pins and spheres at `targets`."""
+    """The simulator with pins, spheres and fibres as `targets` say."""
     if targets is None:
         return sim
     places = named_material(sim.material_at(targets, batch))
     placed = plain_copy(sim)
-    placed.set_material(**{name: places[name].detach() for name in ("pin_targets", "spheres")})
+    moved = [name for name in ("pin_targets", "spheres", "fibre_length") if name in sim.material_names]
+    placed.set_material(**{name: places[name].detach() for name in moved})
     return placed
 
 

@@ -141,7 +141,7 @@ class Simulator(Stepper):
             milliseconds: target of `sim(state)` on this machine. The error is then the lowest for that time, with no
                 more iterations than it takes to get below rounding.
             forces: on the vertices during these steps [B, V, 3] [N].
-            targets: of pins and spheres during these steps, as in `forward`; by default their places in the scene.
+            targets: during these steps, as in `forward`; by default the places and activations of the scene.
             candidates: solvers to choose from, not "auto"; by default those that cannot diverge, with friction without
                 `Multilevel` (docs/limits.md#multilevel-with-friction).
             most: upper bound of the iterations.

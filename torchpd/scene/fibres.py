@@ -33,7 +33,8 @@ class Fibres(KeyPart):
         direction: of the fibres at rest, [3] or one per fibre [N, 3]; normalised here.
         stiffness: w [Pa], a scalar or one value per fibre, positive.
         contraction: relative shortening at an activation of 1, a scalar or one value per fibre in [0, 1].
-        activation: from 0 (passive) to 1, a scalar or one value per fibre.
+        activation: from 0 (passive) to 1, a scalar or one value per fibre, for steps without another one: an activation
+            is an input of each step, `targets={fibres: activation}` (`Simulator.forward`).
         tension_only: whether fibres shorter than L are slack.
         tets: tetrahedra with a fibre [N], numbers or a boolean mask. None: all.
 

@@ -128,6 +128,10 @@ class Scene:
         return self._all(Pin)
 
     @property
+    def fibres(self) -> tuple[Fibres, ...]:
+        return self._all(Fibres)
+
+    @property
     def grounds(self) -> tuple[Ground, ...]:
         return self._all(Ground)
 

@@ -1,11 +1,13 @@
-"""Targets of pins and spheres at the end of a step, as rows of the material."""
+"""Targets of a step, as rows of the material: pins and spheres at its end, and activations of fibres."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.tables import SPHERES
@@ -13,80 +15,134 @@ from .scene import Scene
 
 __all__ = ["Anchors", "Targets"]
 
+Array = NDArray[np.float64]
 Targets = Tensor | Mapping[Any, Tensor]
 _LASTING = slice(SPHERES["center"].stop, SPHERES["motion"].start)  # radius and friction
 
 
-def _overwrite(array: Tensor, rows: slice, value: Tensor) -> Tensor:
-    """`array` [.., n, k] with some rows replaced, batched if either is."""
-    lead = torch.broadcast_shapes(array.shape[:-2], value.shape[:-2])
-    parts = (array[..., : rows.start, :], value, array[..., rows.stop :, :])
-    return torch.cat([part.expand(*lead, *part.shape[-2:]) for part in parts], dim=-2)
+def _overwrite(array: Tensor, rows: slice, value: Tensor, axis: int) -> Tensor:
+    """`array` with some rows of an axis, -1 or -2, replaced; batched if either is."""
+    lead = torch.broadcast_shapes(array.shape[:axis], value.shape[:axis])
+    after = array.shape[axis] - rows.stop
+    parts = (array.narrow(axis, 0, rows.start), value, array.narrow(axis, rows.stop, after))
+    return torch.cat([part.expand(*lead, *part.shape[axis:]) for part in parts], dim=axis)
+
+
+def _check_type(name: str, value: object, like: Tensor) -> None:
+    if not isinstance(value, Tensor):
+        raise TypeError(
+            f"{name} must be a tensor of {like.dtype} on {like.device}, got {type(value).__name__}; "
+            "torch.as_tensor(..., dtype=sim.dtype, device=sim.device) makes one"
+        )
+
+
+def _check_precision(name: str, value: Tensor, like: Tensor) -> None:
+    if value.dtype != like.dtype or value.device != like.device:
+        # half precision is refused even within autocast, unlike for forces
+        half = "; in half precision they would be off by millimetres" if value.dtype.itemsize == 2 else ""
+        raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}{half}")
 
 
 class Anchors:
-    """The pins and spheres of a scene, keyed by `id`, which torch.compile guards."""
+    """The pins, spheres and fibres of a scene, keyed by `id`, which torch.compile guards."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.pins = {id(pin): scene.pin_range(pin) for pin in scene.pins}
         self.spheres = {id(sphere): number for number, sphere in enumerate(scene.spheres)}
+        self.fibres = {id(part): scene.stencil_ranges(part)["fibre"] for part in scene.fibres}
         self.pinned = sum(len(pin.vertices) for pin in scene.pins)
 
     def __reduce__(self) -> tuple[type[Anchors], tuple[Scene]]:
         """Rebuild from the scene, because unpickled parts have other ids."""
         return Anchors, (self.scene,)
 
-    def place(
-        self, targets: Targets | None, pins: Tensor, spheres: Tensor, *, batch: int, time_step: float, fix: str = ""
-    ) -> tuple[Tensor, Tensor]:
-        """`pin_targets` [.., P, 3] and `spheres` [.., S, 8] with `targets` put in.
+    @property
+    def contraction(self) -> Array | None:
+        """Relative shortening at full activation of all fibres [N]; None without fibres."""
+        parts = [part.contraction for part in self.scene.fibres]
+        return np.concatenate(parts) if parts else None
 
-        `fix` ends the errors about another shape or type.
+    def place(
+        self,
+        targets: Targets,
+        material: Mapping[str, Tensor],
+        contraction: Tensor | None,
+        *,
+        batch: int,
+        time_step: float,
+        fix: str = "",
+    ) -> dict[str, Tensor]:
+        """The arrays of the material that `targets` change, by name: `pin_targets`, `spheres`, `fibre_length`.
+
+        `contraction` [N] is that of all fibres. `fix` ends the errors about another shape or type.
         """
-        if targets is None:
-            return pins, spheres
+        placed: dict[str, Tensor] = {}
         if isinstance(targets, Tensor):
-            return self._checked("targets", targets, batch, [(self.pinned, 3)], pins, fix), spheres
+            placed["pin_targets"] = self._checked(
+                "targets", targets, batch, [(self.pinned, 3)], material["pin_targets"], fix
+            )
+            return placed
         if not isinstance(targets, Mapping):
             raise TypeError(
                 f"targets must be a tensor or a mapping from parts to tensors, got {type(targets).__name__}{fix}"
             )
         for part, value in targets.items():
             if id(part) in self.pins:
-                rows = self.pins[id(part)]
-                value = self._checked("targets of a Pin", value, batch, [(rows.stop - rows.start, 3)], pins, fix)
-                pins = _overwrite(pins, rows, value)
+                name, rows = "pin_targets", self.pins[id(part)]
+                shapes = [(rows.stop - rows.start, 3)]
+                value = self._checked("targets of a Pin", value, batch, shapes, material[name], fix)
             elif id(part) in self.spheres:
-                number = self.spheres[id(part)]
-                value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], spheres, fix)
-                row = self._row(spheres, number, value.unsqueeze(-2), time_step)
-                spheres = _overwrite(spheres, slice(number, number + 1), row)
+                name, number = "spheres", self.spheres[id(part)]
+                rows = slice(number, number + 1)
+                value = self._checked("targets of a Sphere", value, batch, [(3,), (6,)], material[name], fix)
+                value = self._row(material[name], number, value.unsqueeze(-2), time_step)
+            elif id(part) in self.fibres:
+                name, rows = "fibre_length", self.fibres[id(part)]
+                assert contraction is not None
+                value = self._lengths(value, contraction[rows], batch, fix)
             else:
                 raise ValueError(
-                    f"targets: this {type(part).__name__} is not a Pin or Sphere of the scene; parts go by identity: "
-                    "a pickled or loaded simulator has its own in sim.scene.pins and sim.scene.spheres"
+                    f"targets: this {type(part).__name__} is not a Pin, Sphere or Fibres of the scene; parts go by "
+                    "identity: a pickled or loaded simulator has its own in sim.scene.pins, sim.scene.spheres and "
+                    "sim.scene.fibres"
                 )
-        return pins, spheres
+            axis = -1 if name == "fibre_length" else -2
+            placed[name] = _overwrite(placed.get(name, material[name]), rows, value, axis)
+        return placed
+
+    def _lengths(self, activation: Tensor, contraction: Tensor, batch: int, fix: str) -> Tensor:
+        """Stretches without tension [n] or [.., n] of fibres: 1 - contraction activation, at least 0."""
+        name, count = "targets of Fibres", len(contraction)
+        _check_type(name, activation, contraction)
+        _check_precision(name, activation, contraction)
+        came = tuple(activation.shape)
+        if came == (batch,) and batch not in (1, count):
+            activation = activation.unsqueeze(-1)
+        elif came == (batch,) and batch > 1:
+            raise ValueError(
+                f"{name}: [{batch}] may be an activation for each of {batch} fibres or of {batch} environments; give "
+                f"[1, {count}] or [{batch}, 1]"
+            )
+        elif not (len(came) <= 2 and came[-1:] in ((), (1,), (count,)) and came[:-1] in ((), (1,), (batch,))):
+            raise ValueError(
+                f"{name} must be an activation [], [{count}], [{batch}] or [{batch}, {count}] (fibres of the part: "
+                f"{count}, environments: {batch}), got {list(came)}{fix}"
+            )
+        # a negative length would have no majoriser
+        return (1.0 - contraction * activation).clamp(min=0.0)
 
     def _checked(
         self, name: str, value: Tensor, batch: int, shapes: Sequence[tuple[int, ...]], like: Tensor, fix: str = ""
     ) -> Tensor:
-        if not isinstance(value, Tensor):
-            raise TypeError(
-                f"{name} must be a tensor of {like.dtype} on {like.device}, got {type(value).__name__}; "
-                "torch.as_tensor(..., dtype=sim.dtype, device=sim.device) makes one"
-            )
+        _check_type(name, value, like)
         came, front = tuple(value.shape), ((), (1,), (batch,))
         if not any(came[-len(shape) :] == shape and came[: -len(shape)] in front for shape in shapes):
             wanted = " or ".join(str(list(shape)) for shape in shapes)
             raise ValueError(
                 f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}{fix}"
             )
-        if value.dtype != like.dtype or value.device != like.device:
-            # half precision is refused even within autocast, unlike for forces
-            half = "; in half precision they would be off by millimetres" if value.dtype.itemsize == 2 else ""
-            raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}{half}")
+        _check_precision(name, value, like)
         return value
 
     def _row(self, spheres: Tensor, number: int, value: Tensor, time_step: float) -> Tensor:

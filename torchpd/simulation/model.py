@@ -84,6 +84,7 @@ class Model(nn.Module):
     pin_targets: Tensor
     planes: Tensor
     spheres: Tensor
+    fibre_contraction: Tensor | None  # [fibres]
     material_names: tuple[str, ...]  # trainable arrays of the scene, in the order of the table
     progress: bool = True  # whether bars show while a large scene compiles, for another device too
 
@@ -128,6 +129,9 @@ class Model(nn.Module):
         with persistent_tensors():
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
+            contraction = self.anchors.contraction
+            held = None if contraction is None else torch.tensor(contraction, dtype=dtype)
+            self.register_buffer("fibre_contraction", held, persistent=False)
             arrays = material_of(values, dtype)
             hard = arrays.pop(PIN_HARD)
             self.material_names = tuple(arrays)
@@ -424,15 +428,15 @@ class Model(nn.Module):
         }
 
     def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]:
-        """The material with pins and spheres at `targets`; `fix` ends errors about targets of another shape."""
+        """The material with pins, spheres and fibres as `targets` say; `fix` ends errors about another shape."""
         material = self.material()
         if targets is None:
             return material
-        pins, spheres = self.anchors.place(
-            targets, self.pin_targets, self.spheres, batch=batch, time_step=self.time_step, fix=fix
+        named = named_material(material)
+        placed = self.anchors.place(
+            targets, named, self.fibre_contraction, batch=batch, time_step=self.time_step, fix=fix
         )
-        replaced = {"pin_targets": pins, "spheres": spheres}
-        return [replaced.get(row, array).contiguous() for row, array in named_material(material).items()]
+        return [placed.get(row, array).contiguous() for row, array in named.items()]
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
         wanted = check_target_device(fn, torch.empty(0, dtype=self.dtype, device=self.device))

@@ -65,6 +65,7 @@ class Stepper(Readable):
             forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant in the step.
             targets: of pins and spheres at the end of the step [m], by part; or one tensor [P, 3] or [B, P, 3] for all
                 pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
+                `Fibres` take their activation during the step, a number [], [B], [n] or [B, n] for n fibres.
             start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
                 The first two are moved along rigid motions and out of contacts. A body that planes would squeeze there
                 starts from x.
@@ -230,7 +231,7 @@ class Stepper(Readable):
 
         Args:
             state: a `State`, or positions [B, V, 3] alone.
-            targets: of pins, as in `forward`.
+            targets: of pins and fibres, as in `forward`.
         """
         positions = self.positions_of(state)
         refuse_forward_mode(positions)
