@@ -45,6 +45,7 @@ if load_extension()[0] is not None:
     from .simulation.distributed import keep_material_per_rank
     from .simulation.readouts import ContactForces, Reactions
     from .simulation.rigid_pieces import RigidPieces
+    from .simulation.stencil_readouts import MembraneStress, Tension
     from .simulation.stress import Stress
 __all__ = [
     "CapturedStep",
@@ -60,6 +61,7 @@ __all__ = [
     "Ground",
     "Info",
     "Jacobi",
+    "MembraneStress",
     "MeshWarning",
     "Multilevel",
     "PatchBody",
@@ -88,6 +90,7 @@ __all__ = [
     "State",
     "Stress",
     "SurfaceLoads",
+    "Tension",
     "TetMesh",
     "Tie",
     "Track",

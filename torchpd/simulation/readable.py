@@ -1,4 +1,4 @@
-"""Read-outs of a model: contact forces, reactions, stress, and files for ParaView."""
+"""Read-outs of a model: contact forces, reactions, stress, tensions, volumes, and files for ParaView."""
 
 from __future__ import annotations
 
@@ -11,12 +11,19 @@ from torch import Tensor
 from ..common.checks import check_like
 from ..ops.adjoint import AdjointCall
 from ..ops.diagonal import named_material
-from ..plan.material import check_environments
+from ..plan.material import check_environments, named_arrays
+from ..scene.cloth import Cloth
+from ..scene.fibres import Fibres
+from ..scene.part import Body
+from ..scene.rod import Rod
+from ..scene.springs import Springs
 from ..scene.targets import Targets
 from .model import Model
 from .readouts import ContactForces, Reactions, contact_forces, reactions
 from .state import State
+from .stencil_readouts import MembraneStress, Tension, membrane_stress, tensions
 from .stress import Stress, stress, vertex_average
+from .volume import volumes
 from .vtu import States, write_vtu
 
 __all__ = ["Readable"]
@@ -81,33 +88,85 @@ class Readable(Model):
         *,
         about: Tensor | None = None,
     ) -> Reactions:
-        """Forces of pins on their vertices [N] in the step from `state` to `after`.
+        """Forces of pins and ties on their vertices [N] in the step from `state` to `after`.
 
         The force of a hard pin is the gradient of the step's objective without pins, that of a soft one k (target -
         x'). The force of a hard pin therefore includes contact forces at its vertices, and the residual of the solve
-        there. The residual of other vertices is `ContactForces.residual`. Differentiable.
+        there. The residual of other vertices is `ContactForces.residual`. A tie pulls its vertex by k (point - x').
+        Differentiable.
 
         Args:
             state, after, forces, targets, about: as in `contact_forces`.
 
         Returns:
             Forces in the order of `pin_targets` [B, P, 3] and on all vertices [B, V, 3], and by pin:
-            `reactions.pins[pin].wrench.force` [B, 3] is its total. `pins` is empty if the scene has none.
+            `reactions.pins[pin].wrench.force` [B, 3] is its total, and `reactions.ties[tie].force` [B, n, 3] the force
+            on the vertices of a tie. `pins` and `ties` are empty if the scene has none.
         """
         return reactions(self.scene, self.checked_call(state, after, forces, targets), about)
 
     def stress(self, state: State | Tensor) -> Stress:
         """Cauchy stress [B, E, 3, 3] and von Mises stress [B, E] [Pa] of every tetrahedron, and its strain.
 
-        sigma = w (F - R) F^T / det F, with w Young's modulus, F the deformation gradient and R its nearest rotation.
-        NaN unless det F > 0, see `Stress.inverted`. Differentiable.
+        sigma = w (F - R) F^T / det F without a Poisson's ratio, with w Young's modulus, F the deformation gradient and
+        R its nearest rotation; `torchpd.simulation.stress` has the formula with one. NaN unless det F > 0, see
+        `Stress.inverted`. Differentiable.
 
         Args:
             state: a `State`, or positions [B, V, 3].
         """
         positions, stiffness = self.positions_of(state), self.stiffness
-        check_environments("state", len(positions), {"stiffness": stiffness})
-        return stress(self.scene, positions, stiffness)
+        rows = {"stiffness": stiffness}
+        if "poisson" in self.material_names:
+            rows["poisson"] = named_arrays(self)["poisson"]
+        check_environments("state", len(positions), rows)
+        return stress(self.scene, positions, stiffness, rows.get("poisson"))
+
+    def membrane_stress(self, state: State | Tensor) -> dict[Cloth, MembraneStress]:
+        """Cauchy stress [N/m] of every triangle by cloth, membrane and threads together, with its strain.
+
+        A force per length of the present triangle, in the axes of its rest plane, which turn with it. Those axes are
+        the ones of `rest_uv`, or else the first edge and its normal in the plane. NaN in triangles without an area.
+        Differentiable.
+
+        Args:
+            state: a `State`, or positions [B, V, 3].
+
+        Example:
+            >>> tension = sim.membrane_stress(state)[shirt].principal[..., 0]  # [B, F] N/m, the largest
+        """
+        positions, material = self._material_for(state, None)
+        return membrane_stress(self.scene, positions, material)
+
+    def tensions(self, state: State | Tensor, targets: Targets | None = None) -> dict[Rod | Springs | Fibres, Tension]:
+        """Tension and strain of every segment of rods, spring and fibre, by part.
+
+        k (length - rest length) [N] for springs and segments. For fibres w (|F f| - L) [Pa], 0 where they are slack.
+        Strains are relative to the length at rest: for fibres to that of the mesh. Differentiable.
+
+        Args:
+            state: a `State`, or positions [B, V, 3].
+            targets: activations of fibres, as in `forward`.
+        """
+        positions, material = self._material_for(state, targets)
+        return tensions(self.scene, positions, material)
+
+    def volume(self, state: State | Tensor) -> dict[Body, Tensor]:
+        """Volume [B] m^3 of every solid, and of every cloth that is closed. Differentiable.
+
+        Inverted tetrahedra count as negative. A closed cloth has the volume that its triangles enclose, negative if
+        they run clockwise seen from outside.
+
+        Args:
+            state: a `State`, or positions [B, V, 3].
+        """
+        return volumes(self.scene, self.positions_of(state))
+
+    def _material_for(self, state: State | Tensor, targets: Targets | None) -> tuple[Tensor, dict[str, Tensor]]:
+        positions = self.positions_of(state)
+        material = named_material(self.material_at(targets, len(positions)))
+        check_environments("state", len(positions), material)
+        return positions, material
 
     def vertex_average(self, values: Tensor) -> Tensor:
         """Average at every vertex of values of its tetrahedra, weighted by their rest volumes. Differentiable.

@@ -1,10 +1,12 @@
-"""Forces of contacts and pins in a step.
+"""Forces of contacts, pins and ties in a step.
 
 At a solved step the gradient g of its objective without pins equals the forces of contacts and pins [N]:
 
     g = m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + elastic gradient = contacts + pins.
 
 Pins. A hard one puts g on its vertex, a soft one k (target - x'). The rest r = g - pins is left for the contacts.
+
+Ties. One puts k (point - x') on its vertex. Being elastic, it is part of the gradient g, not of the balance.
 
 Contacts. At most three colliders act on a vertex, those with the smallest gaps; n_k are their normals. Their normal
 forces p_k minimise |r - sum_k p_k n_k|. An active contact has p_k > 0 and gap_k < 4 max(p_k, n_k . r) / D, because no
@@ -39,12 +41,15 @@ from ..plan.material import CORE_ROWS
 from ..scene.effects import Ground, Pin, Sphere
 from ..scene.part import Body
 from ..scene.scene import Scene
+from ..scene.tie import Tie
+from .stencil_readouts import forces_of_ties
 
 __all__ = [
     "ContactForce",
     "ContactForces",
     "PinForce",
     "Reactions",
+    "TieForce",
     "Wrench",
     "contact_forces",
     "reactions",
@@ -101,12 +106,23 @@ class PinForce(NamedTuple):
         return by_sizes(self, self.force, "batch", "pinned")
 
 
+class TieForce(NamedTuple):
+    """Force of one tie on its vertices; the other body feels the opposite."""
+
+    force: Tensor  # [B, n, 3] N, on the vertices, in the order of `Tie.vertices`
+    wrench: Wrench  # sum and torque
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.force, "batch", "tied")
+
+
 class Reactions(NamedTuple):
-    """Forces of all pins on their vertices in a step, see `Simulator.reactions`."""
+    """Forces of all pins and ties on their vertices in a step, see `Simulator.reactions`."""
 
     force: Tensor  # [B, P, 3] N, on the pinned vertices, in the order of `pin_targets`
     on_vertices: Tensor  # [B, V, 3] N, the same on all vertices, zero on those without a pin
     pins: dict[Pin, PinForce]  # by pin; empty without pins
+    ties: dict[Tie, TieForce]  # by tie; empty without ties
 
     def __repr__(self) -> str:
         return by_sizes(self, self.force, "batch", "pinned")
@@ -178,13 +194,18 @@ def reactions(scene: Scene, call: AdjointCall, about: Tensor | None) -> Reaction
     forces, _ = _pin_forces(call)
     vertices = pinned_vertices(call.plan)
     on_vertices = torch.zeros_like(call.after).index_add(1, vertices, forces)
-    bodies = _bodies(scene, call.after, named_material(call.material)["masses"], about)
+    material = named_material(call.material)
+    bodies = _bodies(scene, call.after, material["masses"], about)
     pins: dict[Pin, PinForce] = {}
     for pin in scene.pins:
         rows = scene.pin_range(pin)
         own = forces[:, rows]
         pins[pin] = PinForce(own, _wrench(own, call.after[:, vertices[rows]], bodies[pin.body].about))
-    return Reactions(forces, on_vertices, pins)
+    ties: dict[Tie, TieForce] = {}
+    for tie, own in forces_of_ties(scene, call.after, material).items():
+        body = bodies[tie.body]
+        ties[tie] = TieForce(own, _wrench(own, body.positions[:, tie.vertices], body.about))
+    return Reactions(forces, on_vertices, pins, ties)
 
 
 # ---- contacts

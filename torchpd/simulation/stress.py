@@ -1,12 +1,14 @@
 """Stress and strain of every tetrahedron.
 
-The energy of a tetrahedron is w V / 2 |F - R|^2. w is Young's modulus, F the deformation gradient and R the nearest
-rotation (see `Solid`). So the first Piola-Kirchhoff stress is P = dE/dF / V = w (F - R), and Cauchy's is
+The energy of a tetrahedron is w V / 2 |F - R|^2 without a Poisson's ratio (see `Solid`). w is Young's modulus, F the
+deformation gradient and R the nearest rotation. With one it is V (mu |F - R|^2 + lambda t^2 / 2), where t is the mean
+of R : (F - R) over the tetrahedron's group. So the first Piola-Kirchhoff stress P = dE/dF / V is w (F - R) or
+2 mu (F - R) + p R, with p = lambda t, at most 2 mu. Cauchy's is
 
-    sigma = P F^T / det F = w (F F^T - R F^T) / det F.
+    sigma = P F^T / det F.
 
-Both are constant in a tetrahedron. The material has Poisson ratio 0. In a partly full tetrahedron (`mesh.fill`) the
-stress is that of its average material.
+All are constant in a tetrahedron. In a partly full tetrahedron (`mesh.fill`) the stress is that of its average
+material.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.reprs import by_sizes
@@ -38,6 +41,22 @@ class Stress(NamedTuple):
         return by_sizes(self, self.cauchy, "batch", "tets", trailing=2)
 
 
+class _Groups(NamedTuple):
+    """Groups of tetrahedra that share the mean of t."""
+
+    of: Tensor  # [E] group of each tetrahedron
+    order: Tensor  # [E] tetrahedra, group after group
+    counts: Tensor  # [G] number of them
+    volumes: Tensor  # [E] m^3 at rest
+
+    def sums(self, values: Tensor, how: str = "sum") -> Tensor:
+        """Sum, or minimum, of values [E] or [B, E] over the members of each group, in order."""
+        rows = values[..., self.order].movedim(-1, 0)
+        flat = rows.flatten(1) if rows.dim() > 1 else rows[:, None]
+        found = torch.segment_reduce(flat, how, lengths=self.counts, axis=0, unsafe=True)
+        return found.unflatten(1, rows.shape[1:]).movedim(0, -1) if rows.dim() > 1 else found[:, 0]
+
+
 class _Rest(NamedTuple):
     """Arrays of the rest shape for read-outs."""
 
@@ -46,6 +65,7 @@ class _Rest(NamedTuple):
     order: Tensor  # [4 E] tetrahedra of each vertex, vertex after vertex
     counts: Tensor  # [V] number of them
     shares: Tensor  # [4 E] share of each in the volume around its vertex
+    groups: _Groups | None  # of a scene with Poisson's ratios
 
 
 # kept, because scenes do not change and a copy to a GPU would wait for it
@@ -66,12 +86,33 @@ def _rest(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Rest:
         whole = (torch.from_numpy(array).to(device) for array in (tets, tet, counts))
         real = (torch.from_numpy(array).to(device, dtype) for array in (np.linalg.inv(edges), shares))
         (corner, tet_of, count), (inverse_edges, share) = whole, real
-        kept[device, dtype] = _Rest(corner, inverse_edges, tet_of, count, share)
+        groups = _groups(scene.values().tet_group, np.linalg.det(edges) / 6.0, device, dtype)
+        kept[device, dtype] = _Rest(corner, inverse_edges, tet_of, count, share, groups)
     return kept[device, dtype]
 
 
-def stress(scene: Scene, positions: Tensor, stiffness: Tensor) -> Stress:
-    """Implementation of `Simulator.stress` for checked positions [B, V, 3] and stiffness [E] or [B, E]."""
+def _groups(
+    numbers: NDArray[np.int64] | None, volumes: NDArray[np.float64], device: torch.device, dtype: torch.dtype
+) -> _Groups | None:
+    if numbers is None:
+        return None
+    whole = (numbers, np.argsort(numbers, kind="stable"), np.bincount(numbers))
+    of, order, counts = (torch.from_numpy(array).to(device) for array in whole)
+    return _Groups(of, order, counts, torch.from_numpy(volumes).to(device, dtype))
+
+
+def _pressure(groups: _Groups, F: Tensor, R: Tensor, double_shear: Tensor, bulk: Tensor) -> Tensor:
+    """p [B, E] Pa: lambda times the mean of t over the group, weighted by V lambda, at most 2 mu of every member."""
+    trace = (R * (F - R)).flatten(2).unbind(-1)
+    weights = groups.volumes * bulk
+    total = groups.sums(weights)
+    mean = groups.sums(weights * sum(trace[1:], trace[0])) / torch.where(total != 0.0, total, 1.0)
+    cap = torch.where(bulk > 0.0, double_shear / torch.where(bulk > 0.0, bulk, 1.0), torch.inf)
+    return bulk * torch.minimum(mean, groups.sums(cap, "min"))[..., groups.of]
+
+
+def stress(scene: Scene, positions: Tensor, stiffness: Tensor, poisson: Tensor | None = None) -> Stress:
+    """Implementation of `Simulator.stress` for checked positions [B, V, 3], stiffness and `poisson` [E] or [B, E]."""
     rest = _rest(scene, positions.device, positions.dtype)
     corners = positions[:, rest.tets]
     F = product((corners[:, :, 1:] - corners[:, :, :1]).mT, rest.inverse_edges)
@@ -82,9 +123,19 @@ def stress(scene: Scene, positions: Tensor, stiffness: Tensor) -> Stress:
     inverted = ~(determinant.detach() > 0.0)
     # so that no NaN reaches the derivatives of the others
     lost = inverted[..., None, None]
-    F = torch.where(lost, identity, F)
-    scale = stiffness / torch.where(inverted, 1.0, determinant)
-    cauchy = scale[..., None, None] * product(F - nearest_rotation(F), F.mT)
+    actual, F = F, torch.where(lost, identity, F)
+    R = nearest_rotation(F)
+    volume = torch.where(inverted, 1.0, determinant)
+    if poisson is None or rest.groups is None:
+        cauchy = (stiffness / volume)[..., None, None] * product(F - R, F.mT)
+    else:
+        double_shear = stiffness / (1.0 + poisson)
+        bulk = double_shear * poisson / (1.0 - 2.0 * poisson)  # Lame's lambda
+        # a group has the mean of its members as they are; the derivative of R : (F - R) is R
+        nearest = torch.where(lost, nearest_rotation(actual.detach()), R)
+        pressure = _pressure(rest.groups, actual, nearest, double_shear, bulk)[..., None, None]
+        piola = double_shear[..., None, None] * (F - R) + pressure * R
+        cauchy = product(piola, F.mT) / volume[..., None, None]
     cauchy = 0.5 * (cauchy + cauchy.mT)  # symmetric except for rounding
     xx, yy, zz = cauchy.diagonal(dim1=-2, dim2=-1).unbind(-1)
     shear = torch.stack((cauchy[..., 0, 1], cauchy[..., 1, 2], cauchy[..., 2, 0]), dim=-1)
