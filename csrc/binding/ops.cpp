@@ -132,6 +132,7 @@ TORCH_LIBRARY(torchpd, m) {
       "effect_products(Tensor positions, Tensor? direction, Tensor[] material, Tensor[] plan) -> "
       "Tensor[]");
   with_plan("elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted) -> Tensor");
+  with_plan("stiffness_at_rest(Tensor[] material, Tensor[] plan) -> Tensor");
   with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
   with_plan(
       "step_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor positions, "

@@ -38,8 +38,7 @@ void step_typed(const StepTensors& t, const Settings& settings) {
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
   check_levels(call.plan, settings.multilevel());
-  call.material =
-      material_view<T>(call.plan, t.material, call.batch, place);
+  call.material = material_view<T>(call.plan, t.material, call.batch, place);
   check_tets(t.material[0], call.plan.tets);
   call.settings = settings;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
@@ -212,8 +211,7 @@ std::vector<Tensor> effect_products(const Tensor& positions, const OptionalTenso
   const Tensor along = direction ? *direction : Tensor();
   std::vector<Tensor> products;
   for (std::size_t i = material_arrays; i < material.size(); ++i) {
-    products.push_back(
-        at::zeros({positions.size(0), material[i].size(-1)}, positions.options()));
+    products.push_back(at::zeros({positions.size(0), material[i].size(-1)}, positions.options()));
   }
   const Tensor out = at::empty({0}, positions.options());
   const Field field = Field::effect_products;
@@ -248,12 +246,12 @@ Tensor element_energy_product(const Tensor& positions, const Tensor& direction,
 }
 
 template <class Backend, class T>
-Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighted) {
+Tensor material_field(Field field, at::TensorList material, at::TensorList plan, bool weighted) {
   FieldCall<T, typename Backend::template Plan<T>> call;
   const Tensor& stiffness = array_of(material, "stiffness");
   const Place place{stiffness.device(), "stiffness"};
   call.plan = Backend::template plan_view<T>(plan, place);
-  call.field = Field::diagonal;
+  call.field = field;
   call.weighted = weighted;
   const Tensor w = stiffness_of(material, call.plan.tets);
   const std::optional<std::int64_t> own = environments_of(material);
@@ -261,13 +259,20 @@ Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighte
   call.batch = own.value_or(1);
   const EffectArrays<T> effects(call.plan, material, call.batch, place);
   call.effects = effects.view;
-  const Tensor out = batched ? at::empty({call.batch, call.plan.vertices}, w.options())
-                             : at::empty({call.plan.vertices}, w.options());
+  const std::int64_t rows =
+      field == Field::diagonal ? call.plan.vertices : count_elements(call.plan);
+  const Tensor out =
+      batched ? at::empty({call.batch, rows}, w.options()) : at::empty({rows}, w.options());
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
   call.out = out.mutable_data_ptr<T>();
   if (call.batch > 0) Backend::field(call, out);
   return out;
+}
+
+template <class Backend, class T>
+Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighted) {
+  return material_field<Backend, T>(Field::diagonal, material, plan, weighted);
 }
 
 template <class Backend>
@@ -277,6 +282,19 @@ Tensor elastic_diagonal(at::TensorList material, at::TensorList plan, bool weigh
   return stiffness.scalar_type() == at::kFloat
              ? diagonal_typed<Backend, float>(material, plan, weighted)
              : diagonal_typed<Backend, double>(material, plan, weighted);
+}
+
+// Stiffness of every element at rest, as a preconditioner takes it, [elements] or [batch, elements]: Young's modulus of
+// tetrahedra [Pa], then that of stencils kind by kind.
+template <class Backend>
+Tensor stiffness_at_rest(at::TensorList material, at::TensorList plan) {
+  const Tensor& stiffness = array_of(material, "stiffness");
+  check_real(stiffness, "stiffness", "[tets] or [batch, tets] (Pa)");
+  if (material.size() == material_arrays) return stiffness.clone();
+  const Field field = Field::stiffness_at_rest;
+  return stiffness.scalar_type() == at::kFloat
+             ? material_field<Backend, float>(field, material, plan, false)
+             : material_field<Backend, double>(field, material, plan, false);
 }
 
 template <class Backend, class T>
@@ -352,6 +370,7 @@ void register_ops(torch::Library& m) {
   m.impl("effect_energy", &effect_energy<Backend>);
   m.impl("effect_products", &effect_products<Backend>);
   m.impl("elastic_diagonal", &elastic_diagonal<Backend>);
+  m.impl("stiffness_at_rest", &stiffness_at_rest<Backend>);
   m.impl("precondition", &precondition<Backend>);
   m.impl("conjugate_gradients_", &conjugate_gradients_inplace<Backend>);
   m.impl("nearest_rotation", &nearest_rotation<Backend>);

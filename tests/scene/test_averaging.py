@@ -41,9 +41,11 @@ def test_groups_hang_together_and_are_full(size: int, least: float) -> None:
 
 
 def test_the_next_member_shares_most_faces() -> None:
-    """3 shares two faces with 0, 1 and 2, where 5 shares one; equal ones go by the number of free neighbours."""
-    neighbours = [[1, 2], [0, 3, 4], [0, 3, 5], [1, 2, 6, 7], [1, 8, 9, 10], [2], [3], [3], [4], [4], [4]]
-    assert _grown(neighbours, 11, 4).tolist() == [0, 0, 0, 0, 1, 2, 3, 4, 1, 1, 1]
+    """2 shares two faces with 0, 1 and 3, where 6 shares one and leaves nothing alone."""
+    neighbours = [[1, 2], [0, 3, 4], [0, 3, 5, 8], [1, 2, 6, 7], [1, 9, 10, 11, 12], [2], [3], [3], [2], *[[4]] * 4]
+    group = _grown(neighbours, 13, 4)
+    assert np.flatnonzero(group == group[0]).tolist() == [0, 1, 2, 3]
+    assert np.bincount(group).tolist() == [4, 4, 1, 1, 1, 1, 1]
 
 
 def test_groups_stay_within_one_material() -> None:

@@ -9,9 +9,13 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from sheets import cloth, surface
 from small_scene import body
 
 import torchpd as pd
+from torchpd.common.warn import SceneWarning
+from torchpd.simulation.notices import warn_of_scene
+from torchpd.simulation.state_checks import report_resolution
 
 
 def test_effects_are_checked() -> None:
@@ -225,3 +229,25 @@ def test_the_former_name_of_the_body_of_a_pin() -> None:
     assert pin.body is solid
     with pytest.raises(TypeError, match="Pin has no argument 'solid'"):
         pd.Pin(vertices=[0], body=solid, solid=solid)
+
+
+def test_thin_bodies_and_small_spheres_are_said() -> None:
+    """Edges of a sheet of 4 x 4 cells are 0.25 m along the sides and 0.354 m across."""
+    sheet = cloth()
+    with pytest.warns(SceneWarning, match=r"sphere of radius 0\.3 m may meet edges .* of up to 0\.354 m") as said:
+        warn_of_scene(pd.Scene(sheet, pd.Sphere((0, -1, 0), 1.0), pd.Sphere((0, -1, 0), 0.3)))
+    assert said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_scene(pd.Scene(sheet, pd.Sphere((0, -1, 0), 0.36)))
+        warn_of_scene(pd.Scene(body(), pd.Sphere((0, -1, 0), 0.01)))
+
+
+def test_sheets_that_float32_cannot_resolve_are_said() -> None:
+    far = pd.Scene(body(), cloth(surface().translated((0.0, 1e5, 0.0))))  # spacing of 1/128, edges of 1/4
+    with pytest.warns(UserWarning, match=r"0\.031 of the shortest edge of an element there \(32 of 80 elements"):
+        report_resolution(far, torch.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report_resolution(far, torch.float64)
+        report_resolution(pd.Scene(cloth()), torch.float32)

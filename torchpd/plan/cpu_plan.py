@@ -27,8 +27,12 @@ __all__ = [
     "kernel_of",
     "loose_pieces",
     "quoted_choices",
+    "stencil_arrays",
     "with_loose_components",
 ]
+
+Index = NDArray[np.int64]
+Reals = NDArray[np.float64]
 
 _WORTH_A_BAR = 200_000  # tetrahedra from which a progress bar is shown
 # in the order of their numbers in the `sizes` of a GPU plan
@@ -196,6 +200,14 @@ def internal_numbers(vertex_order: NDArray[np.int32]) -> NDArray[np.int32]:
     return internal
 
 
+def stencil_arrays(values: SceneValues) -> list[tuple[int, Index, Reals, Reals, Reals]]:
+    """Stencils of a scene as C++ takes them: number of the kind, corners, g_a, measures, constants."""
+    return [
+        (list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants)
+        for group in values.stencils
+    ]
+
+
 def compile_plan(
     values: SceneValues, *, dtype: torch.dtype = torch.float32, patch_size: int | None = None, progress: bool = True
 ) -> Plan:
@@ -211,10 +223,7 @@ def compile_plan(
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
     tets = len(values.tets)
     elements = tets + sum(len(group) for group in values.stencils)
-    stencils = [
-        (list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants)
-        for group in values.stencils
-    ]
+    stencils = stencil_arrays(values)
     with compile_progress(elements, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_plan(
             values.rest_positions, values.tets, stencils, patch_size or _patch_size(elements), advance
