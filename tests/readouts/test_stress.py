@@ -87,6 +87,59 @@ def test_stress_is_the_derivative_of_the_energy() -> None:
     assert float(work) == pytest.approx(float(expected), rel=1e-9)
 
 
+def energy_of(solid: pd.Solid, x: Tensor) -> Tensor:
+    """Sum of V mu |F - R|^2, and of V lambda phi(t) over groups, with R by singular values: written independently."""
+    youngs, poisson, group = (
+        torch.as_tensor(np.array(a)) for a in (solid.youngs, solid.poisson, solid.averaging_groups)
+    )
+    rest, tets = torch.from_numpy(VERTICES)[TETS], torch.from_numpy(TETS)
+    edges = (rest[:, 1:] - rest[:, :1]).mT
+    F = (x[tets][:, 1:] - x[tets][:, :1]).mT @ torch.linalg.inv(edges)
+    u, _, vh = torch.linalg.svd(F.detach())
+    R = u @ torch.diag_embed(torch.stack([torch.ones(len(u)).double()] * 2 + [torch.det(u @ vh)], dim=-1)) @ vh
+    volume = torch.det(edges) / 6.0
+    mu = youngs / (2.0 * (1.0 + poisson))
+    bulk = youngs * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    strain = F - R
+    energy = (volume * mu * strain.square().sum((1, 2))).sum()
+    for number in group.unique():
+        own = group == number
+        weight = (volume * bulk)[own]
+        t = (weight * (R * strain).sum((1, 2))[own]).sum() / weight.sum()
+        cap = (2.0 * mu / bulk)[own].min()
+        energy = energy + weight.sum() * torch.where(t > cap, cap * (t - 0.5 * cap), 0.5 * t * t)
+    return energy
+
+
+@pytest.mark.parametrize("size", [1.0, 1.6])
+def test_with_a_poisson_ratio_it_is_the_derivative_of_the_energy(size: float) -> None:
+    """Virtual work with the mean of t over groups, capped where the body is 1.6 times as large."""
+    poisson = np.linspace(0.2, 0.45, len(TETS))
+    solid = pd.Solid(pd.TetMesh(VERTICES, TETS), youngs=YOUNGS, poisson=poisson, averaging=4)
+    sim = pd.Simulator(pd.Scene(solid), dtype=torch.float64, progress=False)
+    x = size * (sim.rest_positions + 0.01 * noise(sim.rest_positions, 1))
+    x.requires_grad_()
+    (gradient,) = torch.autograd.grad(energy_of(solid, x), x)
+    A = noise(torch.zeros(3, 3), 2).double()
+    corners = x.detach()[torch.from_numpy(TETS)]
+    volumes = torch.det(corners[:, 1:] - corners[:, :1]) / 6.0
+    work = (volumes[:, None, None] * sim.stress(x.detach()[None]).cauchy[0] * A).sum()
+    assert float((gradient * (x.detach() @ A.T)).sum()) == pytest.approx(float(work), rel=1e-9)
+
+
+def test_uniaxial_stress_with_a_poisson_ratio() -> None:
+    """sigma = E (l - 1) / b^2 along it and nothing across, with b = 1 - nu (l - 1) the stretch across."""
+    nu, stretch = 0.4, 1.2
+    across = 1.0 - nu * (stretch - 1.0)
+    sim = pd.Simulator(
+        pd.Scene(pd.Solid(pd.TetMesh(VERTICES, TETS), youngs=YOUNGS, poisson=nu)), dtype=torch.float64, progress=False
+    )
+    found = sim.stress((sim.rest_positions * torch.tensor([stretch, across, across], dtype=torch.float64))[None])
+    expected = torch.zeros(1, len(TETS), 3, 3, dtype=torch.float64)
+    expected[..., 0, 0] = sim.stiffness * (stretch - 1.0) / across**2
+    torch.testing.assert_close(found.cauchy, expected, rtol=0.0, atol=1e-13 * float(sim.stiffness.max()))
+
+
 def test_inverted_tetrahedra_are_marked() -> None:
     sim = body()
     x = sim.rest_positions.clone()[None].repeat(2, 1, 1)

@@ -12,6 +12,7 @@ import pytest
 import torch
 from cases import box
 from runs import noise, small
+from sheets import cloth
 
 import torchpd as pd
 
@@ -131,3 +132,59 @@ def test_what_is_refused_of_a_motion(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"state .*got Tensor"):
         sim.write_vtu(tmp_path / "a.pvd", [track.state(), track.positions[1]])  # type: ignore[list-item]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_cells_of_all_bodies(tmp_path: Path) -> None:
+    """Tetrahedra, triangles and lines have their own fields, NaN in the others, and meshio reads them back."""
+    vertices, tets = box((0.2, 0.1, 0.1), (2, 1, 1))
+    solid = pd.Solid(pd.TetMesh(vertices, tets), 1e4)
+    sheet = cloth()
+    rod = pd.Rod(np.linspace((0.0, 1, 0), (1, 1, 0), 4), 1e6, 0.01)
+    tie = pd.Tie(sheet, [0], solid, [[0.05, 0.05, 0.05]], stiffness=30.0)
+    springs = pd.Springs(rod, [[0, 2], [3, 1]], 10.0, other=sheet)
+    fibres = [pd.Fibres(solid, (1, 0, 0), 1e3, activation=0.5, tets=chosen) for chosen in ([1, 2], [2, 5])]
+    sim = pd.Simulator(pd.Scene(springs, sheet, rod, tie, *fibres, solid), dtype=torch.float64, progress=False)
+    sim.set_material(membrane_youngs=torch.tensor([[1e5], [2e5]]), spring_stiffness=torch.tensor([[5.0], [7.0]]))
+    state = sim.rest_state()
+    state.positions.add_(0.02 * noise(state.positions))
+    own = np.arange(len(tets) + len(sheet.elements) + 5)
+    sim.write_vtu(tmp_path / "all.vtu", state, environment=1, cell_data={"own": own})
+    mesh = meshio.read(tmp_path / "all.vtu")
+    assert [block.type for block in mesh.cells] == ["tetra", "triangle", "line"]
+    starts = {body: sim.scene.vertex_range(body).start for body in sim.scene.bodies}
+    pairs = springs.pairs + np.array([starts[rod], starts[sheet]])
+    corners = [
+        tets + starts[solid],
+        sheet.elements + starts[sheet],
+        np.concatenate([pairs, rod.elements + starts[rod]]),
+    ]
+    assert all(np.array_equal(block.data, wanted) for block, wanted in zip(mesh.cells, corners, strict=True))
+    assert mesh.cell_data.keys() == {
+        "stress", "von_mises", "fibre_tension", "membrane_stress", "tension", "strain", "body", "own",
+    }  # fmt: skip
+    of_kind = {"stress": 0, "von_mises": 0, "fibre_tension": 0, "membrane_stress": 1, "tension": 2, "strain": 2}
+    for name, kind in of_kind.items():
+        assert [bool(np.isnan(values).any()) for values in mesh.cell_data[name]] == [k != kind for k in range(3)]
+    assert [np.unique(values).tolist() for values in mesh.cell_data["body"]] == [[2], [0], [-1, 1]]
+    assert np.array_equal(np.concatenate(mesh.cell_data["own"]), own)
+    tensions = sim.tensions(state)
+    lines = torch.cat([tensions[springs].tension[1], tensions[rod].tension[1]])
+    assert np.array_equal(mesh.cell_data["tension"][2], lines)
+    assert np.array_equal(mesh.cell_data["membrane_stress"][1], sim.membrane_stress(state)[sheet].principal[1])
+    muscle = np.zeros(len(tets))
+    for part in fibres:
+        muscle[part.tets] += tensions[part].tension[1].numpy()
+    assert np.array_equal(mesh.cell_data["fibre_tension"][0], muscle)
+    force = mesh.point_data["tie_force"]
+    pulled = sim.reactions(state, state).ties[tie].force[1, 0].numpy()
+    assert np.array_equal(force[starts[sheet]], pulled)
+    assert np.allclose(force[starts[solid] :].sum(axis=0), -pulled, rtol=1e-12)
+    with pytest.raises(ValueError, match=f"must be .*{len(own)}"):
+        sim.write_vtu(tmp_path / "all.vtu", state, environment=1, cell_data={"own": own[:-1]})
+
+
+def test_cells_of_a_sheet_alone(tmp_path: Path) -> None:
+    sim = pd.Simulator(pd.Scene(cloth()), progress=False)
+    sim.write_vtu(tmp_path / "one.vtu", sim.rest_state())
+    mesh = meshio.read(tmp_path / "one.vtu")
+    assert mesh.cell_data.keys() == {"membrane_stress", "body"}

@@ -177,7 +177,8 @@ class Scene:
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
         masses, component = np.concatenate([body.masses() for body in self.bodies]), self._components()
-        pinned = PinnedComponents.of(positions, masses, component, pin_vertices)
+        stencils = merge_groups(group for part in self.parts for group in part.stencils(lambda body: starts[id(body)]))
+        pinned = PinnedComponents.of(positions, masses, component, pin_vertices, stencils)
         gravity, damping = self._all(Gravity), self._all(Damping)
         none = np.zeros(0)
         poisson, tet_group = self._poisson()
@@ -197,9 +198,7 @@ class Scene:
             component=component,
             pinned=pinned,
             loose=pinned.loose(np.isinf(stiffness)),
-            stencils=merge_groups(
-                group for part in self.parts for group in part.stencils(lambda body: starts[id(body)])
-            ),
+            stencils=stencils,
             poisson=poisson,
             tet_group=tet_group,
         )

@@ -194,8 +194,8 @@ class Readable(Model):
     ) -> Path:
         """Write a state as `.vtu` for ParaView; a track or a list of states as a `.pvd` with one numbered `.vtu` each.
 
-        Files have displacement, velocity, stress, von Mises stress and body, and regions if meshes have them. See
-        `torchpd.simulation.vtu` for the names.
+        Files have displacement and velocity of vertices, and the body of cells: tetrahedra, then triangles, then lines.
+        Cells have stress, tension and strain by their kind; `torchpd.simulation.vtu` has the names.
 
         Args:
             path: of the .vtu, or of the .pvd, beside which the others go; existing files are replaced.
@@ -204,7 +204,7 @@ class Readable(Model):
             times: of the records [s]; by default h, 2 h, ... as of a rollout that records every step.
             point_data: further fields of vertices by name: [B, V, ...], of several states [T, B, V, ...], or [V, ...]
                 for all of them. Tensors or arrays.
-            cell_data: further fields of tetrahedra, with E in place of V.
+            cell_data: further fields of cells, with their number in place of V.
 
         Returns:
             The path.

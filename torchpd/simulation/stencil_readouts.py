@@ -202,3 +202,16 @@ def forces_of_ties(scene: Scene, positions: Tensor, material: dict[str, Tensor])
             (apart,) = _columns(_rest(scene, positions)["tie"], positions, rows)
             found[part] = -material["tie_stiffness"][..., rows, None] * apart
     return found
+
+
+def forces_on_tied(scene: Scene, positions: Tensor, material: dict[str, Tensor]) -> Tensor | None:
+    """Forces of all ties on the vertices of both bodies [B, V, 3] N; None without ties. Adds them up on the CPU."""
+    rest = _rest(scene, positions).get("tie")
+    if rest is None:
+        return None
+    (apart,) = _columns(rest, positions, slice(None))
+    pull = -material["tie_stiffness"].to(positions.device)[..., None] * apart
+    total = torch.zeros_like(positions)
+    for corner in range(rest.corners.shape[1]):
+        total = total.index_add(1, rest.corners[:, corner], rest.gradients[:, corner, :] * pull)
+    return total

@@ -2,14 +2,22 @@
 
     drop.pvd, drop_0000.vtu, drop_0001.vtu, ...
 
-Points are the positions of one environment [m], cells its tetrahedra. Every file has these fields:
+Points are the positions of one environment [m]. Cells are the tetrahedra of solids, the triangles of cloth, and lines
+for segments of rods and for springs, in this order. Files have these fields, those of a kind where the scene has it:
 
-    points  displacement  [m]
-            velocity      [m/s]
-    cells   stress        [Pa], nine numbers row by row, NaN in inverted tetrahedra
-            von_mises     [Pa], NaN in inverted tetrahedra
-            body          number of the solid
-            region        of the mesh, 0 in meshes without; absent if no mesh has regions
+    points  displacement      [m]
+            velocity          [m/s]
+            tie_force         [N], of ties, on both bodies
+    cells   stress            of tetrahedra [Pa], nine numbers row by row, NaN in inverted ones
+            von_mises         of tetrahedra [Pa], NaN in inverted ones
+            fibre_tension     of tetrahedra [Pa], the sum over their fibres
+            membrane_stress   of triangles [N/m], larger and smaller principal value, NaN in collapsed ones
+            tension           of lines [N]
+            strain            of lines
+            body              number of the body; -1 of springs
+            region            of the mesh, 0 in meshes without; absent if no mesh has regions
+
+A field is NaN in cells of other kinds.
 
 The caller may add fields, for example contact forces.
 """
@@ -27,16 +35,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.checks import as_array, check_finite, check_has_values, check_shape, check_target_file, check_whole
+from ..common.tables import EFFECT_ROWS
 from ..plan.compiled import CompiledScene
-from ..plan.material import check_environments
+from ..plan.material import check_environments, dims_of
+from ..scene.effects import Solid
+from ..scene.fibres import Fibres
+from ..scene.part import Body
 from ..scene.scene import Scene
+from ..scene.springs import Springs
 from .state import State, Track
+from .stencil_readouts import forces_on_tied, membrane_stress, tensions
 from .stress import stress
 
 __all__ = ["States", "write_vtu"]
 
 States = State | Track | Sequence[State]
 Fields = dict[str, NDArray[Any]]
+Index = NDArray[np.int64]
 
 
 def write_vtu(
@@ -58,17 +73,19 @@ def write_vtu(
         raise ValueError(f"write_vtu: path must end in {ending} for {what}, got {target.name}")
     batch = len(records[0].positions)
     chosen = _chosen(environment, batch)
-    tets, labels = _cells(compiled.scene)
+    cells, labels = _cells(compiled.scene)
+    count = sum(len(corners) for corners in cells.values())
     front = (batch,) if alone else (len(records), batch)
     points = _given("point_data", point_data, (*front, compiled.vertices), chosen)
-    cells = _given("cell_data", cell_data, (*front, len(tets)), chosen)
+    given = _given("cell_data", cell_data, (*front, count), chosen)
     files = [target] if alone else _numbered(target, len(records))
     instants = _instants(compiled.time_step, times, len(records))
     for number, (file, state) in enumerate(zip(files, records, strict=True)):
-        own_points, own_cells = _own_fields(compiled, state, chosen)
+        own_points, found = _own_fields(compiled, state, chosen)
+        own_cells = {name: _spread(cells, of, values) for name, (of, values) in found.items()}
         point_fields = _joined("point_data", own_points, points, number)
-        cell_fields = _joined("cell_data", {**own_cells, **labels}, cells, number)
-        _write(file, state.positions[chosen], tets, point_fields, cell_fields)
+        cell_fields = _joined("cell_data", {**own_cells, **labels}, given, number)
+        _write(file, state.positions[chosen], cells, point_fields, cell_fields)
     if not alone:
         target.write_text(_collection(files, instants), encoding="utf-8")
     return target
@@ -96,7 +113,9 @@ def _records(compiled: CompiledScene, check: Callable[[State], object], states: 
         raise ValueError(f"write_vtu: states must have one number of environments, got {sorted(batches)}")
     if 0 in batches:
         raise ValueError("write_vtu: states must have at least one environment, got none")
-    check_environments("write_vtu: states", len(found[0][0]), {"stiffness": compiled.named["stiffness"]})
+    names = {"stiffness", *(row.name for row in EFFECT_ROWS)} & compiled.named.keys()
+    elastic = {name: compiled.named[name] for name in sorted(names)}
+    check_environments("write_vtu: states", len(found[0][0]), elastic)
     return [State(*state) for state in found], alone
 
 
@@ -119,26 +138,86 @@ def _instants(time_step: float, times: Sequence[float] | None, count: int) -> li
     return found
 
 
-def _cells(scene: Scene) -> tuple[NDArray[np.int64], Fields]:
-    """Tets [E, 4], and the labels of their bodies and regions."""
-    meshes = [solid.mesh for solid in scene.solids]
-    labels: Fields = {"body": np.repeat(np.arange(len(meshes)), [len(mesh.tets) for mesh in meshes])}
-    if any(mesh.regions is not None for mesh in meshes):
-        regions = [np.zeros(len(m.tets), dtype=np.int64) if m.regions is None else m.regions for m in meshes]
-        labels["region"] = np.concatenate(regions)
-    return scene.tets, labels
+def _cells(scene: Scene) -> tuple[dict[str, Index], Fields]:
+    """Corners of the cells by meshio's kind, and the labels of their bodies and regions."""
+    kinds: dict[str, list[Index]] = {"tetra": [], "triangle": [], "line": []}
+    bodies: dict[str, list[Index]] = {kind: [] for kind in kinds}
+    regions: dict[str, list[Index]] = {kind: [] for kind in kinds}
+
+    def add(kind: str, corners: Index, body: int, region: Index | None) -> None:
+        kinds[kind].append(corners)
+        bodies[kind].append(np.full(len(corners), body))
+        regions[kind].append(np.zeros(len(corners), dtype=np.int64) if region is None else region)
+
+    starts = {id(body): scene.vertex_range(body).start for body in scene.bodies}
+    numbers = {id(body): number for number, body in enumerate(scene.bodies)}
+    for part in scene.parts:  # springs and rods in the order of their stencils
+        if isinstance(part, Body):
+            corners = part.elements + starts[id(part)]
+            region = part.mesh.regions if isinstance(part, Solid) else None
+            add({4: "tetra", 3: "triangle", 2: "line"}[corners.shape[1]], corners, numbers[id(part)], region)
+        elif isinstance(part, Springs):
+            add("line", part.pairs + np.array([starts[id(part.body)], starts[id(part.other)]]), -1, None)
+    labels: Fields = {"body": np.concatenate([array for arrays in bodies.values() for array in arrays])}
+    if any(solid.mesh.regions is not None for solid in scene.solids):
+        labels["region"] = np.concatenate([array for arrays in regions.values() for array in arrays])
+    return {kind: np.concatenate(corners) for kind, corners in kinds.items() if corners}, labels
+
+
+def _spread(cells: Mapping[str, Index], kind: str, values: NDArray[Any]) -> NDArray[Any]:
+    """Values of all cells, NaN in those of other kinds."""
+    whole = np.full((sum(map(len, cells.values())), *values.shape[1:]), np.nan, dtype=values.dtype)
+    start = 0
+    for name, corners in cells.items():
+        if name == kind:
+            whole[start : start + len(corners)] = values
+        start += len(corners)
+    return whole
 
 
 @torch.no_grad()
-def _own_fields(compiled: CompiledScene, state: State, chosen: int) -> tuple[Fields, Fields]:
-    """Fields of points and cells that every file has."""
-    positions = state.positions[chosen]
-    rest = positions.new_tensor(compiled.scene.rest_positions)
-    stiffness = compiled.named["stiffness"].expand(len(state.positions), -1)[chosen]
-    found = stress(compiled.scene, positions[None], stiffness)
+def _own_fields(
+    compiled: CompiledScene, state: State, chosen: int
+) -> tuple[Fields, dict[str, tuple[str, NDArray[Any]]]]:
+    """Fields of points that files have, and those of cells with the kind that has them."""
+    scene, positions = compiled.scene, state.positions[chosen]
+    material = {name: _of_environment(name, array, chosen) for name, array in compiled.named.items()}
+    rest = positions.new_tensor(scene.rest_positions)
     points = {"displacement": positions - rest, "velocity": state.velocities[chosen]}
-    cells = {"stress": found.cauchy[0].flatten(1), "von_mises": found.von_mises[0]}
-    return {k: v.cpu().numpy() for k, v in points.items()}, {k: v.cpu().numpy() for k, v in cells.items()}
+    cells: dict[str, tuple[str, Tensor]] = {}
+    if scene.solids:
+        found = stress(scene, positions[None], material["stiffness"], material.get("poisson"))
+        cells["stress"] = "tetra", found.cauchy[0].flatten(1)
+        cells["von_mises"] = "tetra", found.von_mises[0]
+    if sheets := membrane_stress(scene, positions[None], material):
+        cells["membrane_stress"] = "triangle", torch.cat([sheet.principal[0] for sheet in sheets.values()])
+    pulls = tensions(scene, positions[None], material)
+    if lines := [pull for part, pull in pulls.items() if not isinstance(part, Fibres)]:
+        cells["tension"] = "line", torch.cat([line.tension[0] for line in lines])
+        cells["strain"] = "line", torch.cat([line.strain[0] for line in lines])
+    if scene.fibres:
+        cells["fibre_tension"] = "tetra", _on_tets(scene, {part: pulls[part].tension[0] for part in scene.fibres})
+    if (pulled := forces_on_tied(scene, positions[None].cpu(), material)) is not None:
+        points["tie_force"] = pulled[0]
+    return (
+        {name: values.cpu().numpy() for name, values in points.items()},
+        {name: (kind, values.cpu().numpy()) for name, (kind, values) in cells.items()},
+    )
+
+
+def _of_environment(name: str, array: Tensor, chosen: int) -> Tensor:
+    batched = array.dim() > dims_of(name)
+    return array[chosen if len(array) > 1 else 0] if batched else array
+
+
+def _on_tets(scene: Scene, tensions_of: Mapping[Fibres, Tensor]) -> Tensor:
+    """Sums over the fibres of each tetrahedron [E]."""
+    counts = [len(solid.mesh.tets) for solid in scene.solids]
+    starts = dict(zip(scene.solids, np.cumsum([0, *counts[:-1]]), strict=True))
+    total = torch.zeros(sum(counts), dtype=next(iter(tensions_of.values())).dtype)
+    for part, tension in tensions_of.items():
+        total[torch.from_numpy(part.tets + starts[part.solid])] += tension.cpu()  # each tetrahedron once
+    return total
 
 
 def _given(owner: str, data: Mapping[str, Any] | None, lead: tuple[int, ...], chosen: int) -> Fields:
@@ -176,13 +255,13 @@ def _numbered(target: Path, count: int) -> list[Path]:
     return [target.with_name(f"{target.stem}_{number:0{digits}}.vtu") for number in range(count)]
 
 
-def _write(file: Path, positions: Tensor, tets: NDArray[np.int64], points: Fields, cells: Fields) -> None:
+def _write(file: Path, positions: Tensor, cells: Mapping[str, Index], points: Fields, fields: Fields) -> None:
     import meshio
 
+    ends = np.cumsum([len(corners) for corners in cells.values()])[:-1]
+    by_kind = {name: np.split(values, ends) for name, values in fields.items()}
     corners = positions.detach().cpu().numpy()
-    mesh = meshio.Mesh(
-        corners, [("tetra", tets)], point_data=points, cell_data={name: [values] for name, values in cells.items()}
-    )
+    mesh = meshio.Mesh(corners, list(cells.items()), point_data=points, cell_data=by_kind)
     mesh.write(file, file_format="vtu")
 
 
