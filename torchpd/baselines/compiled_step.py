@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..ops.energy import elastic_energy
 from ..plan.cpu_plan import compile_plan
 from ..plan.material import material_of, material_rows
 from ..reference.problem import StepProblem
@@ -71,7 +72,7 @@ class CompiledStep(CountedStep):
 
     def _energy(self, displacement: Array) -> float:
         pull = displacement - self.target
-        elastic = float(_ops.element_energy(self._positions_tensor(displacement), *self._elements).sum())
+        elastic = float(elastic_energy(self._positions_tensor(displacement), *self._elements))
         return 0.5 * float(np.vdot(self._quadratic * pull, pull)) + elastic
 
     def _gradient(self, displacement: Array) -> Array:

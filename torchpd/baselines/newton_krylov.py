@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ..ops.energy import elastic_energy
 from ..plan.cpu_plan import compile_plan
 from ..plan.material import material_of, material_rows
 from ..plan.preconditioner import precondition_plan
@@ -44,7 +45,8 @@ class NewtonKrylov:
         plan = compile_plan(values, dtype=torch.float64, progress=False)
         self.material = material_rows(material_of(values, torch.float64))
         inertia = torch.from_numpy(np.where(problem.free, problem.weight, np.inf))
-        levels = precondition_plan(plan, values, torch.from_numpy(values.stiffness.copy()), inertia)
+        stiffness = _ops.stiffness_at_rest(self.material, list(plan.arrays))
+        levels = precondition_plan(plan, values, stiffness, inertia)
         self.elements, self.levels = list(plan.arrays), list(levels.arrays)
         self.free = torch.from_numpy(problem.free.copy())[:, None]
         self.weight = torch.from_numpy(problem.weight.copy())[:, None]
@@ -58,7 +60,7 @@ class NewtonKrylov:
         x = (self.start + u)[None]
         pull = torch.where(self.free, u - self.target, 0.0)
         energy = 0.5 * (self.weight * pull.square()).sum()
-        energy = energy + _ops.element_energy(x, self.material, self.elements).sum()
+        energy = energy + elastic_energy(x, self.material, self.elements)[0]
         gradient = self.weight * pull + _ops.gradient(x, self.material, self.elements)[0]
         return float(energy), torch.where(self.free, gradient, 0.0)
 

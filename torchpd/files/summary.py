@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
 from .. import _C
@@ -14,7 +16,14 @@ from ..plan.cpu_plan import quoted_choices
 from ..plan.kernel_choice import shared_bytes
 from ..plan.placement import step_bytes
 from ..plan.preconditioner import has_preconditioner
+from ..scene.cloth import Cloth
+from ..scene.fibres import Fibres
+from ..scene.part import Body
+from ..scene.rod import Rod
+from ..scene.scene import Scene
 from ..scene.solvers import Chebyshev, Multilevel, Solver
+from ..scene.springs import Springs
+from ..scene.tie import Tie
 
 if TYPE_CHECKING:
     from ..accuracy.tuning_result import TuningResult
@@ -25,6 +34,9 @@ __all__ = ["describe", "workspace_bytes"]
 
 # cost of an effect that only changes the weights and targets, which every vertex has anyway
 _FOLDED = "part of the vertex weights: no cost per iteration"
+
+# cost of stencils
+_LOCAL = "a local step each per iteration"
 
 _ANY_BATCH = 2**31 - 1
 _TURNING_MODES = 24  # of the coarse problem of Multilevel("corotated"), see csrc/solver/multilevel/deflation.h
@@ -87,8 +99,7 @@ def _preconditioner_lines(sim: Stepper) -> list[str]:
 
 def _effect_lines(sim: Stepper) -> list[str]:
     scene = sim.scene
-    tets = sum(len(solid.mesh.tets) for solid in scene.solids)
-    lines = [f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step per iteration"]
+    lines = [*_body_lines(scene), *_stencil_lines(scene)]
     if any(solid.mesh.fill is not None for solid in scene.solids):
         lines.append(
             "fill: stiffness and masses are multiplied by the fill of each tetrahedron (mesh.fill), unless set"
@@ -103,6 +114,46 @@ def _effect_lines(sim: Stepper) -> list[str]:
     if scene.spheres:
         lines.append(f"spheres: {len(scene.spheres)}, one projection per vertex and iteration each")
     return lines
+
+
+def _body_lines(scene: Scene) -> list[str]:
+    lines = []
+    if scene.solids:
+        tets = sum(len(solid.mesh.tets) for solid in scene.solids)
+        lines.append(f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step per iteration")
+    groups = [solid.averaging_groups for solid in scene.solids if not isinstance(solid.poisson, float)]
+    if groups:
+        most = max(int(np.bincount(numbers).max()) for numbers in groups)
+        count = sum(int(numbers.max()) + 1 for numbers in groups)
+        lines.append(f"Poisson's ratio: {count} groups of up to {most} tetrahedra share a volume strain")
+    sheets = [body for body in scene.bodies if isinstance(body, Cloth)]
+    if sheets:
+        sizes = _sizes_of(sheets, {"triangle": "triangles", "hinge": "hinges", "thread": "threads"})
+        lines.append(f"cloth: {len(sheets)} ({sizes}), {_LOCAL}")
+    rods = [body for body in scene.bodies if isinstance(body, Rod)]
+    if rods:
+        sizes = _sizes_of(rods, {"spring": "segments", "hinge": "bends"})
+        lines.append(f"rods: {len(rods)} ({sizes}), {_LOCAL}")
+    return lines
+
+
+def _stencil_lines(scene: Scene) -> list[str]:
+    """Springs, ties and fibres."""
+    lines = []
+    for name, part, kind in (("springs", Springs, "spring"), ("ties", Tie, "tie"), ("fibres", Fibres, "fibre")):
+        own = [one for one in scene.parts if isinstance(one, part)]
+        if own:
+            count = sum(len(group) for one in own for group in one.stencils(lambda body: 0) if group.kind == kind)
+            lines.append(f"{name}: {count}, {_LOCAL}")
+    return lines
+
+
+def _sizes_of(bodies: Sequence[Body], words: Mapping[str, str]) -> str:
+    """Numbers of stencils of some bodies by kind, in words."""
+    counts = dict.fromkeys(words, 0)
+    for group in (group for body in bodies for group in body.stencils(lambda body: 0)):
+        counts[group.kind] += len(group)
+    return ", ".join(f"{count} {words[kind]}" for kind, count in counts.items() if count)
 
 
 def _pin_lines(sim: Stepper) -> list[str]:

@@ -32,7 +32,7 @@ def warn_of_scene(scene: Scene) -> None:
     """Warn of bodies that overlap at rest, and of spheres that fit through the meshes of sheets and rods."""
     _say_small_spheres(scene)
     if len(scene.solids) > 1:
-        _say_overlaps(find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
+        _say_overlaps(scene, find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
 
 
 def _say_small_spheres(scene: Scene) -> None:
@@ -52,9 +52,13 @@ def _say_small_spheres(scene: Scene) -> None:
         )
 
 
-def _say_overlaps(found: list[Overlap], where: str) -> None:
+def _say_overlaps(scene: Scene, found: list[Overlap], where: str) -> None:
+    """Warn of pairs of solids, by their numbers among all bodies."""
     if found:
-        pairs = ", ".join(f"{o.first} and {o.second} ({o.points} points of their surfaces)" for o in found[:3])
+        numbers = [number for number, body in enumerate(scene.bodies) if isinstance(body, Solid)]
+        pairs = ", ".join(
+            f"{numbers[o.first]} and {numbers[o.second]} ({o.points} points of their surfaces)" for o in found[:3]
+        )
         more = f" and {len(found) - 3} pairs more" if len(found) > 3 else ""
         warn_user(f"Simulator: bodies {pairs}{more} overlap {where}, and {_ALONE}", SceneWarning)
 
@@ -145,7 +149,7 @@ class Notices:
         places = corners[environment].astype(np.float64)
         if found := find_overlaps([solid.mesh for solid in scene.solids], [places[part] for part in ranges]):
             self._said.add("overlap")
-            _say_overlaps(found, f"in environment {environment} at the end of a step")
+            _say_overlaps(scene, found, f"in environment {environment} at the end of a step")
 
     def _looked_at(self, owner: object, positions: Tensor) -> Scene | None:
         """The scene, if this state can be checked."""

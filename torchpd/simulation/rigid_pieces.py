@@ -20,6 +20,7 @@ from torch import Tensor
 from ..common.checks import check_has_values, check_scalar, check_whole
 from ..ops.diagonal import step_diagonal
 from ..plan.preconditioner import reference_material
+from ..scene.effects import Damping, Gravity, Pin, Solid
 from .state import Info, State
 from .stepper import Stepper
 from .stiff_pieces import find_pieces
@@ -33,6 +34,7 @@ _NOISE = {
     torch.float32: 1e-5,
     torch.float64: 1e-12,
 }  # relative rounding of an energy, as in csrc/solver/multilevel/line_search.h
+_KNOWN = Solid | Pin | Gravity | Damping
 # arrays on which the pieces and their functions depend
 _MADE_OF = ("stiffness", "masses", "damping", "pin_stiffness", "pin_hard")
 
@@ -57,7 +59,8 @@ class RigidPieces:
             and the highest, which must differ by a factor of 100.
 
     Raises:
-        ValueError: contacts in the scene, no free piece, more than 256 pieces, or too little memory.
+        ValueError: contacts, cloth, rods or a Poisson's ratio in the scene, no free piece, more than 256 pieces, or too
+            little memory.
     """
 
     def __init__(self, sim: Stepper, *, stiffer_than: float | None = None) -> None:
@@ -66,6 +69,14 @@ class RigidPieces:
         if sim.planes.shape[-2] or sim.spheres.shape[-2]:
             raise ValueError(
                 "RigidPieces: the scene must have no contacts, which rigid motions do not model; use sim alone"
+            )
+        unknown = sorted({type(part).__name__ for part in sim.scene.parts if not isinstance(part, _KNOWN)})
+        if any(not isinstance(solid.poisson, float) for solid in sim.scene.solids):
+            unknown.append("a Poisson's ratio")
+        if unknown:
+            raise ValueError(
+                "RigidPieces: the scene must have nothing but solids without a Poisson's ratio, got "
+                f"{' and '.join(unknown)}, which rigid motions of its pieces do not model; use sim alone"
             )
         self.sim = sim
         self.stiffer_than = (

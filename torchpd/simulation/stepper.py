@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch
 from torch import Tensor
 
@@ -11,8 +9,9 @@ from ..common.checks import check_like, check_whole
 from ..common.synonyms import check_arguments
 from ..ops.adjoint import step_gradient
 from ..ops.diagonal import elastic_material, named_material
+from ..ops.energy import elastic_energy
 from ..ops.registration import INFO_WIDTH, refuse_forward_mode
-from ..plan.material import CORE_ROWS, environments_of_material, named_arrays
+from ..plan.material import environments_of_material, named_arrays
 from ..scene.targets import Targets
 from .readable import Readable
 from .rollout import PerStep, Rollout, run_rollout
@@ -237,9 +236,7 @@ class Stepper(Readable):
         refuse_forward_mode(positions)
         arrays = self.material_at(targets, positions.shape[0])
         material, elastic, plan = named_material(arrays), elastic_material(arrays), list(self.plan.arrays)
-        energy = cast(Tensor, _ops.element_energy(positions, elastic, plan)).sum(-1)
-        if len(arrays) > len(CORE_ROWS):
-            energy = energy + _ops.effect_energy(positions, elastic, plan)
+        energy = elastic_energy(positions, elastic, plan)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
         energy = energy - (material["masses"] * weight).sum(-1)
         if len(self.plan.pin_vertex):

@@ -86,7 +86,9 @@ def _rest(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Rest:
         whole = (torch.from_numpy(array).to(device) for array in (tets, tet, counts))
         real = (torch.from_numpy(array).to(device, dtype) for array in (np.linalg.inv(edges), shares))
         (corner, tet_of, count), (inverse_edges, share) = whole, real
-        groups = _groups(scene.values().tet_group, np.linalg.det(edges) / 6.0, device, dtype)
+        has_poisson = any(not isinstance(solid.poisson, float) for solid in scene.solids)
+        numbers = scene.values().tet_group if has_poisson else None
+        groups = _groups(numbers, np.linalg.det(edges) / 6.0, device, dtype)
         kept[device, dtype] = _Rest(corner, inverse_edges, tet_of, count, share, groups)
     return kept[device, dtype]
 
