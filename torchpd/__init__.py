@@ -22,7 +22,6 @@ from .scene.solvers import Chebyshev, Jacobi, Multilevel
 from .scene.springs import Springs
 from .scene.tie import Tie
 from .simulation.state import Info, State, Track
-from .simulation.surface_loads import SurfaceLoads
 from .version import __version__
 
 if load_extension()[0] is not None:
@@ -89,7 +88,6 @@ __all__ = [
     "Springs",
     "State",
     "Stress",
-    "SurfaceLoads",
     "Tension",
     "TetMesh",
     "Tie",

@@ -11,8 +11,9 @@ from sheets import cloth, surface
 from torch import Tensor
 
 import torchpd as pd
-from torchpd import Pressure, SurfaceLoads, Wind
+from torchpd import Pressure, Wind
 from torchpd.scene.loads import enclosed_volume
+from torchpd.simulation.surface_loads import SurfaceLoads
 
 EXACT = 1e-12
 
@@ -30,13 +31,24 @@ def hollow() -> pd.Solid:
 
 
 def forces(*parts: Any, positions: Tensor | None = None, velocities: Tensor | None = None, **options: Any) -> Tensor:
-    loads_of = [part for part in parts if isinstance(part, Pressure | Wind)]
-    scene = pd.Scene(*(part for part in parts if not isinstance(part, Pressure | Wind)))
+    scene = pd.Scene(*parts)
     rest = torch.tensor(scene.rest_positions)[None]
     positions = rest if positions is None else positions
     velocities = torch.zeros_like(positions) if velocities is None else velocities
-    given = {"masses": torch.tensor(scene.values().masses), "time_step": 1e-9, **options}
-    return SurfaceLoads(scene, loads_of, torch.float64).forces(positions, velocities, **given)
+    given = {"masses": torch.tensor(scene.values().masses), "time_step": 1e-9, "values": values_of(scene), **options}
+    return loads_of(scene).forces((positions, velocities), **given)
+
+
+def loads_of(scene: pd.Scene, dtype: torch.dtype = torch.float64) -> SurfaceLoads:
+    loads = SurfaceLoads.of(scene, dtype, torch.device("cpu"))
+    assert loads is not None
+    return loads
+
+
+def values_of(scene: pd.Scene, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
+    values = scene.values()
+    found = {"pressure": values.pressure, "wind": values.wind}
+    return {name: torch.tensor(array, dtype=dtype) for name, array in found.items() if array is not None}
 
 
 def moved(scene: pd.Scene, batch: int, scale: float = 0.02) -> tuple[Tensor, Tensor]:
@@ -112,8 +124,8 @@ def test_wind_meets_a_solid_from_one_side_and_no_rod() -> None:
     x = torch.tensor(body.mesh.vertices)
     np.testing.assert_allclose(found[2:].sum(0), [0.0, 0.0, 0.2 * 0.3 * 25.0], atol=1e-12)
     assert not found[2:][x[:, 2] > 0.1].any()
-    with pytest.raises(ValueError, match="Wind: the scene must have a Cloth or a Solid, got none"):
-        SurfaceLoads(pd.Scene(rod), [Wind((1, 0, 0))])
+    with pytest.raises(ValueError, match="Wind acts on a Cloth or a Solid, got rods alone"):
+        pd.Scene(rod, Wind((1, 0, 0)))
 
 
 def test_wind_never_turns_the_motion_around() -> None:
@@ -128,14 +140,14 @@ def test_wind_never_turns_the_motion_around() -> None:
 def test_derivatives_by_finite_differences() -> None:
     body = cloth(octahedron())
     gas, wind = Pressure(body, 2e3, gas=True, ambient=1e3), Wind((3.0, 1.0, 0.5))
-    scene = pd.Scene(body)
-    loads, masses = SurfaceLoads(scene, [gas, wind], torch.float64), torch.tensor(scene.values().masses)
+    scene = pd.Scene(body, gas, wind)
+    loads, masses = loads_of(scene), torch.tensor(scene.values().masses)
     x, v = moved(scene, 2)
-    pascals = torch.tensor([2e3, -50.0], dtype=torch.float64)
+    pascals = torch.tensor([[2e3], [-50.0]], dtype=torch.float64)
     air = torch.tensor([[3.0, 1.0, 0.5], [-1.0, 4.0, 2.0]], dtype=torch.float64)
 
     def call(x: Tensor, v: Tensor, masses: Tensor, pascals: Tensor, air: Tensor) -> Tensor:
-        return loads.forces(x, v, masses, 0.01, {gas: pascals, wind: air})
+        return loads.forces((x, v), masses, 0.01, {"pressure": pascals, "wind": air})
 
     inputs = [one.clone().requires_grad_() for one in (x, v, masses, pascals, air)]
     assert torch.autograd.gradcheck(call, inputs)
@@ -145,14 +157,14 @@ def test_derivatives_by_finite_differences() -> None:
 def test_same_bits_alone_and_in_a_batch() -> None:
     """Forces and derivatives, in float32."""
     body, sheet = hollow(), cloth(surface(cells=(5, 4)))
-    scene = pd.Scene(body, sheet)
-    loads = SurfaceLoads(scene, [Pressure(body, 1e3, gas=True), Wind((3.0, 1.0, 0.5))])
+    scene = pd.Scene(body, sheet, Pressure(body, 1e3, gas=True), Wind((3.0, 1.0, 0.5)))
+    loads, values = loads_of(scene, torch.float32), values_of(scene, torch.float32)
     masses = torch.tensor(scene.values().masses, dtype=torch.float32)
     x, v = (one.float() for one in moved(scene, 7))
 
     def both(x: Tensor, v: Tensor) -> list[Tensor]:
         x, v = x.clone().requires_grad_(), v.clone().requires_grad_()
-        out = loads.forces(x, v, masses, 0.01)
+        out = loads.forces((x, v), masses, 0.01, values)
         return [out.detach(), *torch.autograd.grad(out.square().sum(), (x, v))]
 
     whole = both(x, v)
@@ -160,24 +172,6 @@ def test_same_bits_alone_and_in_a_batch() -> None:
         alone = both(x[environment, None], v[environment, None])
         for one, other in zip(whole, alone, strict=True):
             assert torch.equal(one[environment, None], other)
-
-
-def test_inputs_of_a_step_replace_those_of_the_parts() -> None:
-    body = cloth(octahedron())
-    load, wind = Pressure(body, 1.0), Wind((0.0, 0.0, 0.0))
-    given = {load: torch.tensor(700.0, dtype=torch.float64)}
-    torch.testing.assert_close(forces(body, load, loads=given), forces(body, Pressure(body, 700.0)))
-    blown = {wind: torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)}
-    torch.testing.assert_close(forces(body, wind, loads=blown), forces(body, Wind((1.0, 2.0, 3.0))))
-    for inputs, kind, message in (
-        ({load: 1.0}, TypeError, r"Pressure \(pascals\) must be a tensor .*got float"),
-        ({load: torch.zeros(2).double()}, ValueError, r"Pressure \(pascals\) must be \[\] or \[1\], got \[2\]"),
-        ({wind: torch.zeros(3)}, TypeError, r"Wind \(velocity\) must be torch\.float64 .*got torch\.float32"),
-        ({wind: torch.zeros(2, 3).double()}, ValueError, r"Wind \(velocity\) must be \[3\] or \[1, 3\], got \[2, 3\]"),
-        ({Wind((1, 0, 0)): torch.zeros(3)}, ValueError, "this Wind is none of the parts"),
-    ):
-        with pytest.raises(kind, match=message):
-            forces(body, load, wind, loads=inputs)
 
 
 def test_loads_are_checked() -> None:
@@ -205,7 +199,7 @@ def test_loads_are_checked() -> None:
             make()  # type: ignore[no-untyped-call]
     given = Pressure(full, 1.0, triangles=full.mesh.boundary())
     assert len(given.triangles) == 12
-    with pytest.raises(ValueError, match="body must be a part of the scene, got another one"):
-        SurfaceLoads(pd.Scene(cloth()), [Pressure(closed, 1.0)])
-    with pytest.raises(TypeError, match="SurfaceLoads: parts must be Pressure or Wind, got Gravity"):
-        SurfaceLoads(pd.Scene(closed), [pd.Gravity()])
+    with pytest.raises(ValueError, match="body of a Pressure must be a part of this scene, got another one"):
+        pd.Scene(cloth(), Pressure(closed, 1.0))
+    with pytest.raises(ValueError, match="at most one Wind, got 2"):
+        pd.Scene(closed, Wind((1, 0, 0)), Wind((0, 1, 0)))

@@ -33,6 +33,7 @@ from ..scene.solvers import Chebyshev, Multilevel, Solver
 from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
 from ..simulation.state import State
+from ..simulation.surface_loads import SurfaceLoads
 from .unsolved_step import ROUNDINGS
 
 if TYPE_CHECKING:
@@ -152,13 +153,20 @@ def frictionless(sim: Stepper, dtype: torch.dtype | None = None) -> Stepper:
 def problem_of(
     sim: Stepper, state: State, item: int = 0, *, forces: Tensor | None = None, targets: Targets | None = None
 ) -> StepProblem:
-    """One environment's step in the reference, with the simulator's present material and without friction."""
+    """One environment's step in the reference, with the simulator's present material and without friction.
+
+    Its forces are `forces` and those of pressure and wind.
+    """
     arrays = sim.material_at(targets, state[0].shape[0])
     forces = expand_shared(forces, state[0].shape)
+    pushed = None if forces is None else _double(forces[item])
     material = {}
     for name, array in named_material(arrays).items():
         shared = array.dim() == MATERIAL_ROWS[name].dims
         material[name] = _double(array if shared else array[item if len(array) > 1 else 0])
+    if sim.loads is not None:
+        loads = _load_forces(sim, state, item, material["masses"], targets)
+        pushed = loads if pushed is None else pushed + loads
     planes, spheres = material["planes"], material["spheres"]
     planes[:, PLANES["friction"]] = 0.0
     spheres[:, SPHERES["friction"]] = 0.0
@@ -185,10 +193,22 @@ def problem_of(
         _double(state[0][item]),
         _double(state[1][item]),
         sim.time_step,
-        forces=None if forces is None else _double(forces[item]),
+        forces=pushed,
         sphere_centers=spheres[:, SPHERES["center"]],
         sphere_starts=spheres[:, SPHERES["center"]] - sim.time_step * spheres[:, motion],
     )
+
+
+def _load_forces(sim: Stepper, state: State, item: int, masses: Array, targets: Targets | None) -> Array:
+    """Forces of pressure and wind on one environment [V, 3] N, evaluated in float64."""
+    loads = SurfaceLoads.of(sim.scene, torch.float64, torch.device("cpu"))
+    assert loads is not None
+    values = {}
+    for name, array in sim.load_values(targets, len(state[0])).items():
+        shared = array.dim() == MATERIAL_ROWS[name].dims
+        values[name] = _wide(array if shared else array[item if len(array) > 1 else 0])
+    one = _wide(state[0][item, None]), _wide(state[1][item, None])
+    return _double(loads.forces(one, torch.from_numpy(masses), sim.time_step, values)[0])
 
 
 def _widened(targets: Mapping[Part, Tensor] | None) -> Mapping[Part, Tensor] | None:

@@ -173,13 +173,14 @@ def _default_candidates(sim: Stepper, solvers: Mapping[str, Solver]) -> dict[str
 
 
 def _with_targets(sim: Stepper, targets: Targets | None, batch: int) -> Stepper:
-    """The simulator with pins, spheres and fibres as `targets` say."""
+    """The simulator with pins, spheres, fibres and loads as `targets` say."""
     if targets is None:
         return sim
     places = named_material(sim.material_at(targets, batch))
     placed = plain_copy(sim)
     moved = [name for name in ("pin_targets", "spheres", "fibre_length") if name in sim.material_names]
-    placed.set_material(**{name: places[name].detach() for name in moved})
+    changed = {name: places[name] for name in moved} | sim.load_values(targets, batch)
+    placed.set_material(**{name: value.detach() for name, value in changed.items()})
     return placed
 
 
@@ -500,5 +501,5 @@ def _result(
         device=str(sim.device),
         batch=len(start[0]),
         trials=tuple(trials),
-        material=fingerprint(sim.material()),
+        material=fingerprint([*sim.material(), *sim.load_values(None, 1).values()]),
     )

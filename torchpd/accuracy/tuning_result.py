@@ -46,6 +46,8 @@ class Tuned(Protocol):
 
     def material_at(self, targets: Targets | None, batch: int) -> list[Tensor]: ...
 
+    def load_values(self, targets: Targets | None, batch: int) -> dict[str, Tensor]: ...
+
     def __call__(self, *args: Any, **kwargs: Any) -> Any: ...
 
 
@@ -175,7 +177,7 @@ class TuningResult:
         now = (sim.solver, sim.iterations, sim.time_step, sim.dtype, str(sim.device), sim.tolerance)
         other = self.other_material
         if now[3:5] == (self.dtype, self.device):
-            other = fingerprint(sim.material()) != self.material
+            other = fingerprint([*sim.material(), *sim.load_values(None, 1).values()]) != self.material
             if sim.tuning_result is self:
                 self.invalidate(other)
         return now == (self.solver, self.iterations, self.time_step, self.dtype, self.device, 0.0) and not other

@@ -29,6 +29,7 @@ from ..geometry.tri_mesh import TriMesh
 from ..scene.cloth import Cloth
 from ..scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from ..scene.fibres import Fibres
+from ..scene.loads import Pressure, Wind
 from ..scene.part import Body
 from ..scene.pins import PIN_HARD
 from ..scene.rod import Rod
@@ -46,7 +47,7 @@ _FIRST_ARRAYS = (
     "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets", "planes", "spheres",
 )  # fmt: skip
 _KEY = "torchpd"  # of the metadata; others may add their own keys
-_PARTS = (Solid, Cloth, Rod, Springs, Tie, Fibres, Pin, Gravity, Ground, Sphere, Damping)
+_PARTS = (Solid, Cloth, Rod, Springs, Tie, Fibres, Pin, Pressure, Wind, Gravity, Ground, Sphere, Damping)
 _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in _PARTS}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
 _BODIES = {"body", "other", "solid"}  # fields that hold a body of the scene

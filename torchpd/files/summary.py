@@ -109,6 +109,10 @@ def _effect_lines(sim: Stepper) -> list[str]:
         lines.append(f"gravity: {_FOLDED}")
     if bool((sim.damping != 0).any()):
         lines.append(f"damping: {_FOLDED}")
+    if scene.pressures:
+        lines.append(f"pressures: {len(scene.pressures)}, forces of a step: no cost per iteration")
+    if scene.wind is not None:
+        lines.append("wind: forces of a step: no cost per iteration")
     if scene.grounds:
         lines.append(f"grounds: {len(scene.grounds)}, one projection per vertex and iteration each")
     if scene.spheres:

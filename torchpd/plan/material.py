@@ -10,12 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..common.tables import MATERIAL_TABLE, PLANES, SPHERES
+from ..common.tables import MATERIAL_TABLE, PLANES, SPHERES, MaterialRow
 from ..scene.pins import PIN_HARD, hold_exactly, split_springs
 from ..scene.scene import SceneValues
 
 __all__ = [
     "CORE_ROWS",
+    "LOAD_ROWS",
     "MATERIAL_ROWS",
     "SCENE_NAME_HINTS",
     "check_array",
@@ -31,11 +32,17 @@ __all__ = [
     "material_of",
     "material_rows",
     "named_arrays",
+    "ops_names",
     "real_tensor",
     "with_absent",
 ]
 
-MATERIAL_ROWS = {row.name: row for row in MATERIAL_TABLE}
+# arrays of loads, from which a step computes forces before it calls an op; only some scenes have them
+LOAD_ROWS = (
+    MaterialRow("pressure", 1, "pressure", "overpressure at the rest volume [Pa]", True),
+    MaterialRow("wind", 3, "one", "velocity of the wind [m/s]", True),
+)
+MATERIAL_ROWS = {row.name: row for row in (*MATERIAL_TABLE, *LOAD_ROWS)}
 CORE_ROWS = tuple(row.name for row in MATERIAL_TABLE if not row.effect)  # arrays that every scene has
 # hints for names of scene arguments given to `set_material`
 SCENE_NAME_HINTS = {
@@ -58,7 +65,8 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
     material = {
         name: torch.tensor(spheres if name == "spheres" else getattr(values, name), dtype=dtype) for name in CORE_ROWS
     }
-    material |= {name: torch.tensor(row, dtype=dtype) for name, row in effect_rows(values).items()}
+    others = effect_rows(values) | _load_rows(values)
+    material |= {name: torch.tensor(row, dtype=dtype) for name, row in others.items()}
     soft = torch.isfinite(torch.from_numpy(values.pin_stiffness.copy()))
     if not bool(torch.isfinite(material["pin_stiffness"])[soft].all()):
         raise ValueError(
@@ -78,6 +86,12 @@ def effect_rows(values: SceneValues) -> dict[str, NDArray[np.float64]]:
     return {row.name: found[row.name] for row in MATERIAL_TABLE if row.name in found}
 
 
+def _load_rows(values: SceneValues) -> dict[str, NDArray[np.float64]]:
+    """Arrays of the loads that a scene has, in the order of the table."""
+    found = {row.name: getattr(values, row.name) for row in LOAD_ROWS}
+    return {name: row for name, row in found.items() if row is not None}
+
+
 def dims_of(name: str) -> int:
     """Number of dimensions of an array without a batch."""
     return 1 if name == PIN_HARD else MATERIAL_ROWS[name].dims
@@ -91,16 +105,23 @@ def named_arrays(sim: nn.Module) -> dict[str, Tensor]:
 def material_rows(arrays: Mapping[str, Tensor]) -> list[Tensor]:
     """Rows of the material in the order of the ops, from the arrays by name."""
     held = {"pin_stiffness": hold_exactly(arrays["pin_stiffness"], arrays[PIN_HARD])}
-    return with_absent([held.get(name, array) for name, array in arrays.items() if name != PIN_HARD], arrays)
+    names = ops_names(arrays)
+    return with_absent([held.get(name, arrays[name]) for name in names], names)
+
+
+def ops_names(names: Iterable[str]) -> tuple[str, ...]:
+    """The arrays that the ops read, of those of a simulator."""
+    others = {PIN_HARD, *(row.name for row in LOAD_ROWS)}
+    return tuple(name for name in names if name not in others)
 
 
 def with_absent(arrays: list[Tensor], names: Iterable[str]) -> list[Tensor]:
     """The material of the ops: an effect that the scene lacks is an empty array, if the scene has another one."""
-    by_name = dict(zip((name for name in names if name != PIN_HARD), arrays, strict=True))
+    by_name = dict(zip(names, arrays, strict=True))
     if len(by_name) == len(CORE_ROWS):
         return arrays
     unread = torch.empty(0, dtype=arrays[0].dtype, device=arrays[0].device)
-    return [by_name.get(name, unread) for name in MATERIAL_ROWS]
+    return [by_name.get(row.name, unread) for row in MATERIAL_TABLE]
 
 
 def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:

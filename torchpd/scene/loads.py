@@ -1,4 +1,4 @@
-"""Loads on surfaces: the pressure of a gas, and wind. `SurfaceLoads` turns them into the forces of a step."""
+"""Loads on surfaces: the pressure of a gas, and wind. A step takes their forces at its start."""
 
 from __future__ import annotations
 
@@ -26,11 +26,15 @@ Index = NDArray[np.int64]
 class Pressure(KeyPart):
     """The pressure of a gas in a closed surface: p A n on every triangle, a third to each corner.
 
-    A step takes the force at its start. It is stable while the pressure is far below the stiffness of the body.
+    A step takes the force at its start (explicit), so it oscillates where the pressure is too stiff. p times the edge
+    length [N/m] must stay far below the stiffness K of a vertex plus m / h^2. A gas of total surface A adds (p0 +
+    ambient) A^2 / V0 [N/m]. That must stay below 4 M / h^2 plus the body's stiffness against uniform growth, with M its
+    mass. Take shorter time steps, or a smaller `ambient`.
 
     Args:
         body: a closed `Cloth`, such as a balloon, or a `Solid` with a cavity.
-        pascals: overpressure p0 at the rest volume V0 [Pa]; negative for suction. `loads` of a step replace it.
+        pascals: overpressure p0 at the rest volume V0 [Pa]; negative for suction. An input of each step,
+            `targets={pressure: pascals}` (`Simulator.forward`), replaces it.
         gas: whether the amount of gas is constant: p = (p0 + ambient) V0 / V - ambient. Else p is constant.
         ambient: pressure around the body [Pa], >= 0; 101325 is the atmosphere, and makes gas almost incompressible.
         triangles: the surface of the gas [F, 3], vertices of the body counter-clockwise seen from outside the gas.
@@ -40,7 +44,9 @@ class Pressure(KeyPart):
         ValueError: the surface is open, or encloses no positive volume.
 
     Example:
-        >>> balloon = Pressure(cloth, 500.0, gas=True)
+        >>> air = Pressure(balloon, 500.0, gas=True)
+        >>> sim = Simulator(Scene(balloon, air))
+        >>> state = sim(state, targets={air: torch.tensor(600.0)})  # [Pa], for this step
     """
 
     body: Body
@@ -74,21 +80,29 @@ class Pressure(KeyPart):
             triangles=chosen,
         )
 
+    def bodies_used(self) -> tuple[Body, ...]:
+        return (self.body,)
+
 
 @dataclass(eq=False, repr=False)
 class Wind(KeyPart):
     """A uniform wind on every cloth and solid: drag rho c / 2 A (u . n)^2 along the normal n of every triangle.
 
-    u is the wind relative to the triangle. Both sides of a cloth feel it, and a solid where the wind blows onto it. A
-    step takes the force at its start, divided by 1 + h |force| / (m |u . n|), so that it never turns u . n around.
+    u is the wind relative to the triangle. Both sides of a cloth feel it, and a solid where the wind blows onto it;
+    rods do not. A step takes the force at its start (explicit), divided by 1 + h |force| / (m |u . n|), so that it never
+    turns u . n around. For a light sheet, h |force| far above m |u . n|, a shorter time step is more accurate.
 
     Args:
-        velocity: of the wind [3] m/s. `loads` of a step replace it.
+        velocity: of the wind [3] m/s. An input of each step, `targets={wind: velocity}` (`Simulator.forward`), replaces
+            it.
         drag: coefficient c, >= 0; 1.2 is a flat plate across the wind.
         density: rho of the medium [kg/m^3], positive: 1.2 is air, 1000 water.
 
     Example:
-        >>> breeze = Wind((4.0, 0.0, 1.0))
+        >>> wind = Wind((4.0, 0.0, 1.0))
+        >>> sim = Simulator(Scene(flag, Pin(flag, pole), Gravity(), wind))
+        >>> gusts = lambda step: {wind: torch.tensor([4.0 + math.sin(0.1 * step), 0.0, 1.0])}
+        >>> track = sim.rollout(sim.rest_state(), 300, targets=gusts)
     """
 
     velocity: Array

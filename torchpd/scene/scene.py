@@ -13,6 +13,7 @@ from ..geometry.mesh_faces import mesh_components
 from .cloth import Cloth
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .fibres import Fibres
+from .loads import Pressure, Wind
 from .part import Body
 from .pins import PinnedComponents
 from .rod import Rod
@@ -22,7 +23,9 @@ from .tie import Tie
 
 __all__ = ["Part", "Scene", "SceneValues"]
 
-Part = Solid | Cloth | Rod | Springs | Tie | Fibres | Pin | Gravity | Ground | Sphere | Damping
+Part = (
+    Solid | Cloth | Rod | Springs | Tie | Fibres | Pin | Pressure | Wind | Gravity | Ground | Sphere | Damping
+)
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -49,6 +52,8 @@ class SceneValues:
     stencils: tuple[StencilGroup, ...] = ()  # at most one group per kind, in the order of `stencils.KINDS`
     poisson: Array | None = None  # [E] Poisson's ratio, None where every solid has the scalar 0
     tet_group: Index | None = None  # [E] numbers of the groups that share a volume strain, None without `poisson`
+    pressure: Array | None = None  # [pressures] Pa, None without any
+    wind: Array | None = None  # [3] m/s, None without
 
 
 def _no_part(part: object) -> TypeError:
@@ -63,9 +68,9 @@ class Scene:
     `SceneWarning` if they overlap at rest, and once if they overlap after a step with `return_info=True`.
 
     Args:
-        parts: bodies (`Solid`, `Cloth`, `Rod`), what acts on them (`Pin`, `Springs`, `Tie`, `Fibres`), and `Gravity`,
-            `Ground`, `Sphere`, `Damping`. At least one body; at most one `Gravity` and one `Damping`. A part acts on
-            bodies of this scene; no vertex is pinned twice.
+        parts: bodies (`Solid`, `Cloth`, `Rod`), what acts on them (`Pin`, `Springs`, `Tie`, `Fibres`, `Pressure`), and
+            `Gravity`, `Wind`, `Ground`, `Sphere`, `Damping`. At least one body; at most one `Gravity`, one `Wind` and
+            one `Damping`. A part acts on bodies of this scene; no vertex is pinned twice.
     """
 
     @check_arguments("Scene")
@@ -79,9 +84,11 @@ class Scene:
         if len({id(part) for part in parts}) != len(parts):
             twice = next(part for number, part in enumerate(parts) if any(part is one for one in parts[:number]))
             raise ValueError(f"Scene: each part must be given once, got the same {type(twice).__name__} twice")
-        for kind in (Gravity, Damping):
+        for kind in (Gravity, Damping, Wind):
             if len(self._all(kind)) > 1:
                 raise ValueError(f"Scene takes at most one {kind.__name__}, got {len(self._all(kind))}")
+        if self.wind is not None and all(isinstance(body, Rod) for body in self.bodies):
+            raise ValueError("Scene: Wind acts on a Cloth or a Solid, got rods alone, which do not feel it")
         bodies = {id(body) for body in self.bodies}
         for part in parts:
             if any(id(body) not in bodies for body in part.bodies_used()):
@@ -130,6 +137,14 @@ class Scene:
     @property
     def fibres(self) -> tuple[Fibres, ...]:
         return self._all(Fibres)
+
+    @property
+    def pressures(self) -> tuple[Pressure, ...]:
+        return self._all(Pressure)
+
+    @property
+    def wind(self) -> Wind | None:
+        return next(iter(self._all(Wind)), None)
 
     @property
     def grounds(self) -> tuple[Ground, ...]:
@@ -201,6 +216,8 @@ class Scene:
             stencils=stencils,
             poisson=poisson,
             tet_group=tet_group,
+            pressure=np.array([part.pascals for part in self.pressures]) if self.pressures else None,
+            wind=None if self.wind is None else self.wind.velocity,
         )
 
     def _components(self) -> Index:

@@ -1,4 +1,4 @@
-"""Targets of a step, as rows of the material: pins and spheres at its end, and activations of fibres."""
+"""Targets of a step, as rows of the material: pins and spheres at its end; activations, pressures and wind in it."""
 
 from __future__ import annotations
 
@@ -44,13 +44,15 @@ def _check_precision(name: str, value: Tensor, like: Tensor) -> None:
 
 
 class Anchors:
-    """The pins, spheres and fibres of a scene, keyed by `id`, which torch.compile guards."""
+    """The pins, spheres, fibres and loads of a scene, keyed by `id`, which torch.compile guards."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self.pins = {id(pin): scene.pin_range(pin) for pin in scene.pins}
         self.spheres = {id(sphere): number for number, sphere in enumerate(scene.spheres)}
         self.fibres = {id(part): scene.stencil_ranges(part)["fibre"] for part in scene.fibres}
+        self.pressures = {id(part): number for number, part in enumerate(scene.pressures)}
+        self.wind = None if scene.wind is None else id(scene.wind)
         self.pinned = sum(len(pin.vertices) for pin in scene.pins)
 
     def __reduce__(self) -> tuple[type[Anchors], tuple[Scene]]:
@@ -101,14 +103,30 @@ class Anchors:
                 name, rows = "fibre_length", self.fibres[id(part)]
                 assert contraction is not None
                 value = self._lengths(value, contraction[rows], batch, fix)
+            elif id(part) in self.pressures or id(part) == self.wind:
+                continue
             else:
                 raise ValueError(
-                    f"targets: this {type(part).__name__} is not a Pin, Sphere or Fibres of the scene; parts go by "
-                    "identity: a pickled or loaded simulator has its own in sim.scene.pins, sim.scene.spheres and "
-                    "sim.scene.fibres"
+                    f"targets: this {type(part).__name__} is not a Pin, Sphere, Fibres, Pressure or Wind of the scene; "
+                    "parts go by identity: a pickled or loaded simulator has its own in sim.scene.pins, "
+                    "sim.scene.spheres, sim.scene.fibres, sim.scene.pressures and sim.scene.wind"
                 )
             axis = -1 if name == "fibre_length" else -2
             placed[name] = _overwrite(placed.get(name, material[name]), rows, value, axis)
+        return placed
+
+    def place_loads(
+        self, targets: Targets | None, loads: Mapping[str, Tensor], *, batch: int, fix: str = ""
+    ) -> dict[str, Tensor]:
+        """The arrays of loads by name, `pressure` [.., n] and `wind` [.., 3], with `targets` put in."""
+        placed = dict(loads)
+        for part, value in targets.items() if isinstance(targets, Mapping) else ():
+            if id(part) in self.pressures:
+                number, pressure = self.pressures[id(part)], placed["pressure"]
+                value = self._checked("targets of a Pressure", value, batch, [()], pressure, fix)
+                placed["pressure"] = _overwrite(pressure, slice(number, number + 1), value.unsqueeze(-1), -1)
+            elif id(part) == self.wind:
+                placed["wind"] = self._checked("targets of a Wind", value, batch, [(3,)], placed["wind"], fix)
         return placed
 
     def _lengths(self, activation: Tensor, contraction: Tensor, batch: int, fix: str) -> Tensor:
@@ -136,8 +154,8 @@ class Anchors:
         self, name: str, value: Tensor, batch: int, shapes: Sequence[tuple[int, ...]], like: Tensor, fix: str = ""
     ) -> Tensor:
         _check_type(name, value, like)
-        came, front = tuple(value.shape), ((), (1,), (batch,))
-        if not any(came[-len(shape) :] == shape and came[: -len(shape)] in front for shape in shapes):
+        came = tuple(value.shape)
+        if not any(came in (shape, (1, *shape), (batch, *shape)) for shape in shapes):
             wanted = " or ".join(str(list(shape)) for shape in shapes)
             raise ValueError(
                 f"{name} must be {wanted}, or that with a batch of {batch} in front, got {list(value.shape)}{fix}"

@@ -57,7 +57,7 @@ class CapturedStep:
         self._rows = torch.empty(rows, dtype=torch.float64, device=sim.device) if report else None
         # the graph holds addresses only, so the tensors must live as long as the graph
         own = dict(targets) if isinstance(targets, Mapping) else targets
-        self._alive = ([array.detach() for array in named_arrays(sim).values()], forces, own, start)
+        self._alive = ([array.detach() for array in named_arrays(sim).values()], sim.loads, forces, own, start)
 
         def run(moved: State) -> None:
             sim.step_(moved, forces, targets, start, info=self._rows)

@@ -16,7 +16,7 @@ from ..ops.diagonal import named_material
 from ..plan.compiled import persistent_tensors
 from ..plan.cpu_plan import Plan, compile_plan
 from ..plan.kernel_choice import check_kernel
-from ..plan.material import CORE_ROWS, material_of, with_absent
+from ..plan.material import CORE_ROWS, material_of, ops_names, with_absent
 from ..plan.mutation_guard import MutationGuard, check_rest
 from ..plan.placement import check_target_device, is_recording
 from ..scene.pins import PIN_HARD, hold_exactly
@@ -56,6 +56,7 @@ from .state_checks import (
     positions_of,
     report_resolution,
 )
+from .surface_loads import SurfaceLoads
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -85,7 +86,8 @@ class Model(nn.Module):
     planes: Tensor
     spheres: Tensor
     fibre_contraction: Tensor | None  # [fibres]
-    material_names: tuple[str, ...]  # trainable arrays of the scene, in the order of the table
+    material_names: tuple[str, ...]  # trainable arrays of the scene, in the order of the tables
+    loads: SurfaceLoads | None  # None without pressure or wind
     progress: bool = True  # whether bars show while a large scene compiles, for another device too
 
     @check_arguments("Simulator")
@@ -134,10 +136,11 @@ class Model(nn.Module):
             self.register_buffer("fibre_contraction", held, persistent=False)
             arrays = material_of(values, dtype)
             hard = arrays.pop(PIN_HARD)
-            self.material_names = tuple(arrays)
+            self.material_names, self._ops_names = tuple(arrays), ops_names(arrays)
             for name, array in arrays.items():
                 self.register_parameter(name, nn.Parameter(array, requires_grad=False))
             self.register_buffer(PIN_HARD, hard)
+            self.loads = SurfaceLoads.of(scene, dtype, self.device)
         self._refresh_pin_mask()
         warn_of_scene(scene)
         if device is not None:  # first, since "auto" chooses for it
@@ -293,8 +296,8 @@ class Model(nn.Module):
         return [array if array.is_contiguous() else array.contiguous() for array in arrays]
 
     def _own_arrays(self) -> list[Tensor]:
-        arrays = [getattr(self, name) for name in self.material_names]
-        return arrays if len(arrays) == len(CORE_ROWS) else with_absent(arrays, self.material_names)
+        arrays = [getattr(self, name) for name in self._ops_names]
+        return arrays if len(arrays) == len(CORE_ROWS) else with_absent(arrays, self._ops_names)
 
     def _held_springs(self, arrays: list[Tensor]) -> Tensor:
         hard = self._buffers[PIN_HARD]  # nn.Module.__getattr__ would double the time of this method
@@ -454,6 +457,8 @@ class Model(nn.Module):
                 new = moved(self.compiled, wanted.dtype, wanted.device)
             super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
             self._take(new)
+            if self.loads is not None:
+                self.loads = SurfaceLoads.of(self.scene, wanted.dtype, wanted.device)
             if loses_positions:
                 # the material may have been trained, so it keeps its digits
                 report_resolution(self.scene, wanted.dtype)

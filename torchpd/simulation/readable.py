@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from ..common.checks import check_like
 from ..ops.adjoint import AdjointCall
 from ..ops.diagonal import named_material
-from ..plan.material import check_environments, named_arrays
+from ..ops.registration import refuse_forward_mode
+from ..plan.material import LOAD_ROWS, check_environments, named_arrays
 from ..scene.cloth import Cloth
 from ..scene.fibres import Fibres
 from ..scene.part import Body
@@ -41,7 +43,40 @@ class Readable(Model):
         check_like("after", positions, before, "m")
         material = self.material_at(targets, len(before))
         check_environments("state", len(before), named_material(material))
+        forces = self.forces_at(state, forces, targets, material)
         return AdjointCall(before, state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
+
+    def forces_at(
+        self, state: State, forces: Tensor | None, targets: Targets | None, material: list[Tensor]
+    ) -> Tensor | None:
+        """All forces of a step from a checked state: `forces`, and those of pressure and wind."""
+        if self.loads is None:
+            return forces
+        refuse_forward_mode(*state)
+        positions, named = self.positions_of(state), named_material(material)
+        values = self.load_values(targets, len(positions))
+        check_environments("state", len(positions), {"masses": named["masses"], **values})
+        own = self.loads.forces((positions, state[1]), named["masses"], self.time_step, values)
+        return own if forces is None else forces + own
+
+    def load_values(self, targets: Targets | None, batch: int) -> dict[str, Tensor]:
+        """The arrays `pressure` and `wind` of a step, those that the scene has."""
+        own = {row.name: getattr(self, row.name) for row in LOAD_ROWS if row.name in self.material_names}
+        return self.anchors.place_loads(targets, own, batch=batch)
+
+    def load_forces(self, state: State, targets: Targets | None = None) -> Tensor:
+        """Forces of pressure and wind on the vertices [B, V, 3] [N] in a step from `state`. Differentiable.
+
+        They are those at the start of the step. A step adds them to its `forces`, so no one has to give them.
+
+        Args:
+            state: start of the step.
+            targets: as in `forward`, the same as in that step.
+        """
+        self.check_state(state)
+        positions = self.positions_of(state)
+        found = self.forces_at(state, None, targets, self.material_at(targets, len(positions)))
+        return torch.zeros_like(positions) if found is None else found
 
     def contact_forces(
         self,

@@ -21,6 +21,7 @@ from ..common.checks import check_has_values, check_scalar, check_whole
 from ..ops.diagonal import step_diagonal
 from ..plan.preconditioner import reference_material
 from ..scene.effects import Damping, Gravity, Pin, Solid
+from ..scene.loads import Pressure, Wind
 from .state import Info, State
 from .stepper import Stepper
 from .stiff_pieces import find_pieces
@@ -34,7 +35,7 @@ _NOISE = {
     torch.float32: 1e-5,
     torch.float64: 1e-12,
 }  # relative rounding of an energy, as in csrc/solver/multilevel/line_search.h
-_KNOWN = Solid | Pin | Gravity | Damping
+_KNOWN = Solid | Pin | Gravity | Damping | Pressure | Wind
 # arrays on which the pieces and their functions depend
 _MADE_OF = ("stiffness", "masses", "damping", "pin_stiffness", "pin_hard")
 

@@ -15,6 +15,7 @@ from ..common.checks import STEPS_DIFFER
 from ..plan.material import CORE_ROWS
 from ..scene.targets import Anchors, Targets
 from .state import Info, State, Track
+from .surface_loads import SurfaceLoads
 
 __all__ = ["PerStep", "Rollout", "run_rollout"]
 
@@ -27,6 +28,7 @@ class Steps(Protocol):
     """The parts of a simulator that a rollout uses."""
 
     anchors: Anchors
+    loads: SurfaceLoads | None
 
     @property
     def time_step(self) -> float: ...
@@ -39,6 +41,10 @@ class Steps(Protocol):
     def material(self) -> list[Tensor]: ...
 
     def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]: ...
+
+    def forces_at(
+        self, state: State, forces: Tensor | None, targets: Targets | None, material: list[Tensor]
+    ) -> Tensor | None: ...
 
     def advance(
         self,
@@ -74,7 +80,7 @@ def run_rollout(sim: Steps, call: Rollout, *, progress: bool) -> Track:
     if progress:
         with tqdm(total=call.steps, desc="simulating", unit="step", leave=False) as bar:
             found = _in_chunks(sim, call, forces, material, bar)
-    elif callable(call.forces) or callable(call.targets):
+    elif _changes(sim, call):
         # without a disabled bar, because torch.compile cannot trace one
         found = _in_chunks(sim, call, forces, material, None)
     else:
@@ -88,15 +94,17 @@ def run_rollout(sim: Steps, call: Rollout, *, progress: bool) -> Track:
 def _in_chunks(
     sim: Steps, call: Rollout, forces: Tensor | None, material: list[Tensor], bar: tqdm[NoReturn] | None
 ) -> tuple[Tensor, ...]:
-    """Take single steps if forces or targets are functions, else chunks of about 0.1 s.
+    """Take single steps if anything changes between steps, else chunks of about 0.1 s.
 
     Between chunks the bar moves, and Ctrl-C is noticed on a GPU.
     """
-    adaptive = not (callable(call.forces) or callable(call.targets))
+    adaptive = not _changes(sim, call)
+    targets = None if callable(call.targets) else call.targets
     chunks, state, done, steps, size = [], call.state, 0, 0, 1
     while done < call.steps:
         if callable(call.targets):
-            material = _material_after(sim, material, call.targets(call.first + done), state[0].shape[0])
+            targets = call.targets(call.first + done)
+            material = _material_after(sim, material, targets, state[0].shape[0])
         elif done:
             material = _moved_on(material, steps)
         if callable(call.forces):
@@ -108,7 +116,13 @@ def _in_chunks(
         recorded, every = steps >= left, min(steps, call.every)
         begin = time.perf_counter() if bar is not None else 0.0
         chunk = sim.advance(
-            state, forces, material, steps=steps, every=every, inertial=call.inertial, report=call.report and recorded
+            state,
+            sim.forces_at(state, forces, targets, material),
+            material,
+            steps=steps,
+            every=every,
+            inertial=call.inertial,
+            report=call.report and recorded,
         )
         if recorded:
             chunks.append(chunk)
@@ -120,6 +134,11 @@ def _in_chunks(
     if not chunks:
         chunks.append(sim.advance(call.state, None, material, steps=0, every=1, inertial=call.inertial, report=False))
     return tuple(torch.cat(parts) for parts in zip(*chunks, strict=True))
+
+
+def _changes(sim: Steps, call: Rollout) -> bool:
+    """Whether inputs change between steps: functions of the step number, and loads, which follow the state."""
+    return callable(call.forces) or callable(call.targets) or sim.loads is not None
 
 
 def _finish(device: torch.device) -> float:

@@ -65,6 +65,7 @@ class Stepper(Readable):
             targets: of pins and spheres at the end of the step [m], by part; or one tensor [P, 3] or [B, P, 3] for all
                 pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
                 `Fibres` take their activation during the step, a number [], [B], [n] or [B, n] for n fibres.
+                A `Pressure` takes its overpressure [] or [B] Pa, `Wind` its velocity [3] or [B, 3] m/s.
             start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
                 The first two are moved along rigid motions and out of contacts. A body that planes would squeeze there
                 starts from x.
@@ -75,6 +76,7 @@ class Stepper(Readable):
         """
         forces = self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])
+        forces = self.forces_at(state, forces, targets, material)
         given, inertial = _first_iterate(start, state[0])
         refuse_forward_mode(*state, forces, *material)
         self._notices.before(self, state, material, self.time_step, report=return_info)
@@ -122,6 +124,7 @@ class Stepper(Readable):
             )
         given, inertial = _first_iterate(start, state[0])
         material = self.material_at(targets, state[0].shape[0])
+        forces = self.forces_at(state, forces, targets, material)
         self._notices.before(self, state, material, self.time_step, report=info is not None)
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
@@ -226,7 +229,8 @@ class Stepper(Readable):
     def energy(self, state: State | Tensor, targets: Targets | None = None) -> Tensor:
         """Mechanical energy of each environment [B] [J], differentiable twice.
 
-        Elastic energy, springs of soft pins, weight (zero at the origin) and, for a `State`, kinetic energy.
+        Elastic energy, springs of soft pins, weight (zero at the origin) and, for a `State`, kinetic energy. Pressure and
+        wind are no part of it: they are forces of a step.
 
         Args:
             state: a `State`, or positions [B, V, 3] alone.

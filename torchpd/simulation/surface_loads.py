@@ -5,7 +5,7 @@ Triangles are gathered to vertices in a fixed order, and so are the derivatives:
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.small_matrices import dot, length, tree_sum
-from ..scene.loads import Pressure, Wind, enclosed_volume, wind_surface
+from ..scene.loads import Wind, enclosed_volume, wind_surface
 from ..scene.scene import Scene
 
-__all__ = ["LoadInputs", "SurfaceLoads"]
+__all__ = ["SurfaceLoads"]
 
 Index = NDArray[np.int64]
-LoadInputs = Mapping[Any, Tensor]  # values of a step by Pressure or Wind
 
 # The gas law takes volumes of at least this share of that at rest.
 _LEAST_VOLUME = 1e-2
@@ -99,141 +98,98 @@ class _Surface:
 
 @dataclass(frozen=True, eq=False)
 class _Gas:
-    part: Pressure
     surface: _Surface
+    ambient: float | None  # [Pa] by the gas law, None for a constant pressure
     rest_volume: float
 
-    def forces(self, positions: Tensor, given: Tensor | None) -> Tensor:
+    def forces(self, positions: Tensor, pascals: Tensor) -> Tensor:
+        """p A n of every triangle, with pressures [] or [B] Pa."""
         corners = self.surface.corners(positions)
         areas = _area_vectors(corners)
-        pascals = _given(self.part, "pascals", given, positions, ())
-        if pascals is None:
-            pascals = positions.new_full((len(positions),), self.part.pascals)
-        if self.part.gas:
-            least = _LEAST_VOLUME * self.rest_volume
-            volume = _volume(corners, areas).clamp(min=least)
-            pascals = (pascals + self.part.ambient) * (self.rest_volume / volume) - self.part.ambient
-        return self.surface.thirds(pascals[:, None, None] * areas)
+        if self.ambient is not None:
+            volume = _volume(corners, areas).clamp(min=_LEAST_VOLUME * self.rest_volume)
+            pascals = (pascals + self.ambient) * (self.rest_volume / volume) - self.ambient
+        return self.surface.thirds(pascals[..., None, None] * areas)
 
 
 @dataclass(frozen=True, eq=False)
 class _Blown:
-    part: Wind
-    velocity: Tensor  # [3]
     surface: _Surface
     two_sided: Tensor  # [F]
     shares: Tensor  # [F, 3] of each triangle in the surface around its corners
+    drag: float  # rho c / 2 [kg/m^3]
 
     def forces(
-        self, positions: Tensor, velocities: Tensor, masses: Tensor, time_step: float, given: Tensor | None
+        self, positions: Tensor, velocities: Tensor, masses: Tensor, time_step: float, wind: Tensor
     ) -> Tensor:
+        """Drag of every triangle, with a wind [3] or [B, 3] m/s."""
         areas = _area_vectors(self.surface.corners(positions))
         size = length(areas)
         normals = areas / torch.where(size > 0.0, size, 1.0)[..., None]
-        wind = _given(self.part, "velocity", given, positions, (3,))
-        if wind is None:
-            wind = self.velocity.expand(len(positions), 3)
         own = self.surface.corners(velocities)
-        along = dot(wind[:, None] - (own[:, :, 0] + own[:, :, 1] + own[:, :, 2]) / 3.0, normals)
+        along = dot(wind[..., None, :] - (own[:, :, 0] + own[:, :, 1] + own[:, :, 2]) / 3.0, normals)
         along = torch.where(self.two_sided | (along < 0.0), along, 0.0)
-        push = 0.5 * self.part.density * self.part.drag * size * along.abs()  # [kg/s]
+        push = self.drag * size * along.abs()  # [kg/s]
         at_corners = masses[..., self.surface.triangles] * self.shares
         mass = at_corners[..., 0] + at_corners[..., 1] + at_corners[..., 2]
         return self.surface.thirds((push * along / (1.0 + time_step * push / mass))[..., None] * normals)
 
 
+@dataclass(frozen=True, eq=False)
 class SurfaceLoads:
-    """Pressures and winds on the bodies of a scene, as forces of a step.
+    """The pressures and the wind of a scene, as forces of a step."""
 
-    Args:
-        scene: the scene that is stepped.
-        parts: `Pressure` on bodies of that scene, and `Wind`.
-        dtype, device: those of states.
+    gases: tuple[_Gas, ...]
+    wind: _Blown | None
 
-    Example:
-        >>> loads = SurfaceLoads(scene, [Wind((5.0, 0.0, 0.0))])
-        >>> push = loads.forces(*state, sim.masses, sim.time_step)
-        >>> state = sim(state, forces=push)
-    """
-
-    def __init__(
-        self,
-        scene: Scene,
-        parts: Sequence[Pressure | Wind],
-        dtype: torch.dtype = torch.float32,
-        device: torch.device | str = "cpu",
-    ) -> None:
-        place, count = torch.device(device), len(scene.rest_positions)
-        self._gases: list[_Gas] = []
-        self._winds: list[_Blown] = []
-        for part in parts:
-            if isinstance(part, Pressure):
-                triangles = part.triangles + scene.vertex_range(part.body).start
-                volume = enclosed_volume(part.body.mesh.vertices, part.triangles)
-                self._gases.append(_Gas(part, _Surface.of(triangles, count, place), volume))
-            elif isinstance(part, Wind):
-                self._winds.append(_blown(scene, part, count, dtype, place))
-            else:
-                raise TypeError(f"SurfaceLoads: parts must be Pressure or Wind, got {type(part).__name__}")
+    @staticmethod
+    def of(scene: Scene, dtype: torch.dtype, device: torch.device) -> SurfaceLoads | None:
+        """The loads of a scene in the precision of states; None without any."""
+        if not scene.pressures and scene.wind is None:
+            return None
+        gases = []
+        for part in scene.pressures:
+            triangles = part.triangles + scene.vertex_range(part.body).start
+            volume = enclosed_volume(part.body.mesh.vertices, part.triangles)
+            surface = _Surface.of(triangles, len(scene.rest_positions), device)
+            gases.append(_Gas(surface, part.ambient if part.gas else None, volume))
+        return SurfaceLoads(tuple(gases), None if scene.wind is None else _blown(scene, scene.wind, dtype, device))
 
     def forces(
-        self, positions: Tensor, velocities: Tensor, masses: Tensor, time_step: float, loads: LoadInputs | None = None
+        self, state: tuple[Tensor, Tensor], masses: Tensor, time_step: float, values: Mapping[str, Tensor]
     ) -> Tensor:
         """Forces on the vertices [B, V, 3] N at the start of a step, differentiable.
 
         Args:
-            positions: [B, V, 3] m.
-            velocities: [B, V, 3] m/s.
+            state: positions and velocities [B, V, 3].
             masses: of the vertices [V] or [B, V] kg, which limit the wind.
             time_step: [s].
-            loads: pressures [] or [B] Pa, and velocities of the wind [3] or [B, 3] m/s, by part; others are those of
-                the parts.
+            values: `pressure` [n] or [B, n] Pa and `wind` [3] or [B, 3] m/s, those that the scene has.
         """
-        inputs = dict(loads or {})
+        positions, velocities = state
         total = torch.zeros_like(positions)
-        for gas in self._gases:
-            total = total + gas.forces(positions, inputs.pop(gas.part, None))
-        for blown in self._winds:
-            given = inputs.pop(blown.part, None)
-            total = total + blown.forces(positions, velocities, masses, time_step, given)
-        if inputs:
-            kind = type(next(iter(inputs))).__name__
-            raise ValueError(f"loads: this {kind} is none of the parts, which go by identity")
+        for number, gas in enumerate(self.gases):
+            total = total + gas.forces(positions, values["pressure"][..., number])
+        if self.wind is not None:
+            total = total + self.wind.forces(positions, velocities, masses, time_step, values["wind"])
         return total
 
 
-def _blown(scene: Scene, part: Wind, count: int, dtype: torch.dtype, device: torch.device) -> _Blown:
+def _blown(scene: Scene, part: Wind, dtype: torch.dtype, device: torch.device) -> _Blown:
     triangles, both = [], []
     for body in scene.bodies:
         surface = wind_surface(body)
         if surface is not None:
             triangles.append(surface[0] + scene.vertex_range(body).start)
             both.append(np.full(len(surface[0]), surface[1]))
-    if not triangles:
-        raise ValueError("Wind: the scene must have a Cloth or a Solid, got none; rods do not feel the wind")
-    corners = np.concatenate(triangles)
-    places = scene.rest_positions[corners]
+    corners, vertices = np.concatenate(triangles), scene.rest_positions
+    places = vertices[corners]
     areas = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
-    around = np.bincount(corners.reshape(-1), weights=np.repeat(areas, 3), minlength=count)
+    around = np.bincount(corners.reshape(-1), weights=np.repeat(areas, 3), minlength=len(vertices))
     shares = torch.tensor(areas[:, None] / around[corners], dtype=dtype, device=device)
     two_sided = torch.tensor(np.concatenate(both), device=device)
-    velocity = torch.tensor(part.velocity, dtype=dtype, device=device)
-    return _Blown(part, velocity, _Surface.of(corners, count, device), two_sided, shares)
-
-
-def _given(part: object, name: str, value: Tensor | None, like: Tensor, shape: tuple[int, ...]) -> Tensor | None:
-    """A value of a step for every environment [B, *shape], or None."""
-    if value is None:
-        return None
-    owner, batch = f"loads of a {type(part).__name__} ({name})", len(like)
-    if not isinstance(value, Tensor):
-        raise TypeError(f"{owner} must be a tensor of {like.dtype} on {like.device}, got {type(value).__name__}")
-    if value.shape not in (shape, (1, *shape), (batch, *shape)):
-        raise ValueError(f"{owner} must be {list(shape)} or {[batch, *shape]}, got {list(value.shape)}")
-    if value.dtype != like.dtype or value.device != like.device:
-        raise TypeError(f"{owner} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}")
-    expanded: Tensor = value.expand(batch, *shape)
-    return expanded
+    drag = 0.5 * part.density * part.drag
+    return _Blown(_Surface.of(corners, len(vertices), device), two_sided, shares, drag)
 
 
 def _area_vectors(corners: Tensor) -> Tensor:
