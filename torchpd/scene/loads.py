@@ -89,8 +89,9 @@ class Wind(KeyPart):
     """A uniform wind on every cloth and solid: drag rho c / 2 A (u . n)^2 along the normal n of every triangle.
 
     u is the wind relative to the triangle. Both sides of a cloth feel it, and a solid where the wind blows onto it;
-    rods do not. A step takes the force at its start (explicit), divided by 1 + h |force| / (m |u . n|), so that it never
-    turns u . n around. For a light sheet, h |force| far above m |u . n|, a shorter time step is more accurate.
+    rods do not. A step takes the force at its start (explicit), at most m |u . n| / h with m the mass of the triangle, so
+    that it never turns u . n around. This bound weakens the wind on a sheet lighter than h rho c / 2 |u . n| [kg/m^2]:
+    take shorter time steps there.
 
     Args:
         velocity: of the wind [3] m/s. An input of each step, `targets={wind: velocity}` (`Simulator.forward`), replaces

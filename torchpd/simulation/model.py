@@ -23,6 +23,7 @@ from ..scene.pins import PIN_HARD, hold_exactly
 from ..scene.scene import Scene
 from ..scene.solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, SolverName, check_solver
 from ..scene.targets import Anchors, Targets
+from .load_checks import warn_of_loads
 from .material_update import (
     check_change,
     check_keys,
@@ -143,6 +144,7 @@ class Model(nn.Module):
             self.loads = SurfaceLoads.of(scene, dtype, self.device)
         self._refresh_pin_mask()
         warn_of_scene(scene)
+        warn_of_loads(self)
         if device is not None:  # first, since "auto" chooses for it
             self.to(device)
         if is_auto(solver):

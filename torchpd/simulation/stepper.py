@@ -76,7 +76,8 @@ class Stepper(Readable):
         """
         forces = self.check_state(state, forces=forces)
         material = self.material_at(targets, state[0].shape[0])
-        forces = self.forces_at(state, forces, targets, material)
+        if self.loads is not None:
+            forces = self.forces_at(state, forces, targets, material)
         given, inertial = _first_iterate(start, state[0])
         refuse_forward_mode(*state, forces, *material)
         self._notices.before(self, state, material, self.time_step, report=return_info)
@@ -124,7 +125,8 @@ class Stepper(Readable):
             )
         given, inertial = _first_iterate(start, state[0])
         material = self.material_at(targets, state[0].shape[0])
-        forces = self.forces_at(state, forces, targets, material)
+        if self.loads is not None:
+            forces = self.forces_at(state, forces, targets, material)
         self._notices.before(self, state, material, self.time_step, report=info is not None)
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(

@@ -129,10 +129,10 @@ class _Blown:
         own = self.surface.corners(velocities)
         along = dot(wind[..., None, :] - (own[:, :, 0] + own[:, :, 1] + own[:, :, 2]) / 3.0, normals)
         along = torch.where(self.two_sided | (along < 0.0), along, 0.0)
-        push = self.drag * size * along.abs()  # [kg/s]
         at_corners = masses[..., self.surface.triangles] * self.shares
         mass = at_corners[..., 0] + at_corners[..., 1] + at_corners[..., 2]
-        return self.surface.thirds((push * along / (1.0 + time_step * push / mass))[..., None] * normals)
+        push = torch.minimum(self.drag * size * along.abs(), mass / time_step)  # [kg/s]
+        return self.surface.thirds((push * along)[..., None] * normals)
 
 
 @dataclass(frozen=True, eq=False)
