@@ -97,6 +97,18 @@ def test_train_distributed(tmp_path: Path) -> None:
     assert weights == same  # one network
 
 
+def test_flag(run, tmp_path: Path) -> None:
+    rows = r"^ +\S+ +(\S+) +\S+, +\S+, +(\S+) +(\S+)$"
+    blown = re.findall(rows, run("flag.py", "--steps", "16", "--cells", "4"), flags=re.MULTILINE)
+    assert trimesh.load(tmp_path / "flag.glb", force="mesh").faces.shape == (2 * 6 * 4, 3)
+    calm = re.findall(rows, run("flag.py", "--steps", "16", "--cells", "4", "--speed", "0"), flags=re.MULTILINE)
+    assert len(blown) == len(calm) == 8
+    sides = [[float(side) for _, side, _ in rows] for rows in (blown, calm)]
+    assert sides[0] == sorted(sides[0]) and sides[0][-1] > 0.1  # the first gust blows to that side
+    assert not any(sides[1])  # it falls in its plane
+    assert float(blown[-1][2]) > float(calm[-1][2])  # the wind pulls at the pole
+
+
 def test_push_to_goal(run) -> None:
     text = run("push_to_goal.py", "--steps", "8", "--tries", "4")
     distances = [float(number) for number in re.findall(r"^ +\d+ +(\S+)$", text, flags=re.MULTILINE)]
