@@ -29,7 +29,7 @@ class Pressure(KeyPart):
     A step takes the force at its start (explicit), so it oscillates where the pressure is too stiff. p times the edge
     length [N/m] must stay far below the stiffness K of a vertex plus m / h^2. A gas of total surface A adds (p0 +
     ambient) A^2 / V0 [N/m]. That must stay below 4 M / h^2 plus the body's stiffness against uniform growth, with M its
-    mass. Take shorter time steps, or a smaller `ambient`.
+    mass: take shorter time steps, or a smaller `ambient`. A `SceneWarning` says when a gas is too stiff.
 
     Args:
         body: a closed `Cloth`, such as a balloon, or a `Solid` with a cavity.
@@ -89,9 +89,9 @@ class Wind(KeyPart):
     """A uniform wind on every cloth and solid: drag rho c / 2 A (u . n)^2 along the normal n of every triangle.
 
     u is the wind relative to the triangle. Both sides of a cloth feel it, and a solid where the wind blows onto it;
-    rods do not. A step takes the force at its start (explicit), at most m |u . n| / h with m the mass of the triangle, so
-    that it never turns u . n around. This bound weakens the wind on a sheet lighter than h rho c / 2 |u . n| [kg/m^2]:
-    take shorter time steps there.
+    rods do not. A step takes the force at its start (explicit): at most m |u . n| / h, with m the mass of the triangle,
+    so that it never turns u . n around. The bound weakens the wind on sheets lighter than h rho c / 2 |u . n| [kg/m^2].
+    Take shorter time steps there; a `SceneWarning` names them.
 
     Args:
         velocity: of the wind [3] m/s. An input of each step, `targets={wind: velocity}` (`Simulator.forward`), replaces

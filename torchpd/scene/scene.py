@@ -23,9 +23,7 @@ from .tie import Tie
 
 __all__ = ["Part", "Scene", "SceneValues"]
 
-Part = (
-    Solid | Cloth | Rod | Springs | Tie | Fibres | Pin | Pressure | Wind | Gravity | Ground | Sphere | Damping
-)
+Part = Solid | Cloth | Rod | Springs | Tie | Fibres | Pin | Pressure | Wind | Gravity | Ground | Sphere | Damping
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 

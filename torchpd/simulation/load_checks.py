@@ -12,6 +12,7 @@ from ..scene.loads import Pressure, enclosed_volume
 
 if TYPE_CHECKING:
     from .model import Model
+    from .surface_loads import Blown
 
 __all__ = ["warn_of_loads"]
 
@@ -26,7 +27,7 @@ def warn_of_loads(sim: Model) -> None:
         if part.gas:
             _check_gas(sim, part)
     if sim.loads is not None and sim.loads.wind is not None:
-        _check_wind(sim)
+        _check_wind(sim, sim.loads.wind)
 
 
 def _check_gas(sim: Model, part: Pressure) -> None:
@@ -54,11 +55,9 @@ def _check_gas(sim: Model, part: Pressure) -> None:
         )
 
 
-def _check_wind(sim: Model) -> None:
-    """Find the mass per area below which a step bounds the wind of the scene when it blows across."""
-    assert sim.loads is not None and sim.loads.wind is not None
-    blown, rest = sim.loads.wind, sim.rest_positions.detach()
-    corners = blown.surface.triangles
+def _check_wind(sim: Model, blown: Blown) -> None:
+    """Find triangles so light that a step bounds the wind of the scene when it blows across."""
+    rest, corners = sim.rest_positions.detach(), blown.surface.triangles
     masses = (sim.masses.detach()[corners] * blown.shares).sum(1)
     x, y, z = rest[corners].unbind(1)
     areas = 0.5 * torch.linalg.cross(y - x, z - x).norm(dim=1)

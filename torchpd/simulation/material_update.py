@@ -122,7 +122,8 @@ def _hint(name: str) -> str:
     if name == "poisson":
         return "; every solid has poisson=0.0, which leaves it out: give Solid(poisson=) another number or an array"
     if name in MATERIAL_ROWS:
-        return f"; the scene has no {MATERIAL_ROWS[name].rows}"
+        rows = MATERIAL_ROWS[name].rows
+        return f"; the scene has no {name if rows == 'one' else rows}"
     return f"; {SCENE_NAME_HINTS[name]}" if name in SCENE_NAME_HINTS else ""
 
 

@@ -87,6 +87,8 @@ class Model(nn.Module):
     planes: Tensor
     spheres: Tensor
     fibre_contraction: Tensor | None  # [fibres]
+    pressure: Tensor  # where the scene has it, like the next
+    wind: Tensor
     material_names: tuple[str, ...]  # trainable arrays of the scene, in the order of the tables
     loads: SurfaceLoads | None  # None without pressure or wind
     progress: bool = True  # whether bars show while a large scene compiles, for another device too

@@ -231,8 +231,8 @@ class Stepper(Readable):
     def energy(self, state: State | Tensor, targets: Targets | None = None) -> Tensor:
         """Mechanical energy of each environment [B] [J], differentiable twice.
 
-        Elastic energy, springs of soft pins, weight (zero at the origin) and, for a `State`, kinetic energy. Pressure and
-        wind are no part of it: they are forces of a step.
+        Elastic energy, springs of soft pins, weight (zero at the origin) and, for a `State`, kinetic energy. It leaves
+        out pressure and wind, which are forces of a step.
 
         Args:
             state: a `State`, or positions [B, V, 3] alone.

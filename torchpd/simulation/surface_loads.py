@@ -18,7 +18,7 @@ from ..common.small_matrices import dot, length, tree_sum
 from ..scene.loads import Wind, enclosed_volume, wind_surface
 from ..scene.scene import Scene
 
-__all__ = ["SurfaceLoads"]
+__all__ = ["Blown", "SurfaceLoads"]
 
 Index = NDArray[np.int64]
 
@@ -98,6 +98,8 @@ class _Surface:
 
 @dataclass(frozen=True, eq=False)
 class _Gas:
+    """A gas in one surface."""
+
     surface: _Surface
     ambient: float | None  # [Pa] by the gas law, None for a constant pressure
     rest_volume: float
@@ -113,15 +115,15 @@ class _Gas:
 
 
 @dataclass(frozen=True, eq=False)
-class _Blown:
+class Blown:
+    """Wind on the surfaces of all bodies."""
+
     surface: _Surface
     two_sided: Tensor  # [F]
     shares: Tensor  # [F, 3] of each triangle in the surface around its corners
     drag: float  # rho c / 2 [kg/m^3]
 
-    def forces(
-        self, positions: Tensor, velocities: Tensor, masses: Tensor, time_step: float, wind: Tensor
-    ) -> Tensor:
+    def forces(self, positions: Tensor, velocities: Tensor, masses: Tensor, time_step: float, wind: Tensor) -> Tensor:
         """Drag of every triangle, with a wind [3] or [B, 3] m/s."""
         areas = _area_vectors(self.surface.corners(positions))
         size = length(areas)
@@ -140,7 +142,7 @@ class SurfaceLoads:
     """The pressures and the wind of a scene, as forces of a step."""
 
     gases: tuple[_Gas, ...]
-    wind: _Blown | None
+    wind: Blown | None
 
     @staticmethod
     def of(scene: Scene, dtype: torch.dtype, device: torch.device) -> SurfaceLoads | None:
@@ -175,7 +177,7 @@ class SurfaceLoads:
         return total
 
 
-def _blown(scene: Scene, part: Wind, dtype: torch.dtype, device: torch.device) -> _Blown:
+def _blown(scene: Scene, part: Wind, dtype: torch.dtype, device: torch.device) -> Blown:
     triangles, both = [], []
     for body in scene.bodies:
         surface = wind_surface(body)
@@ -189,7 +191,7 @@ def _blown(scene: Scene, part: Wind, dtype: torch.dtype, device: torch.device) -
     shares = torch.tensor(areas[:, None] / around[corners], dtype=dtype, device=device)
     two_sided = torch.tensor(np.concatenate(both), device=device)
     drag = 0.5 * part.density * part.drag
-    return _Blown(_Surface.of(corners, len(vertices), device), two_sided, shares, drag)
+    return Blown(_Surface.of(corners, len(vertices), device), two_sided, shares, drag)
 
 
 def _area_vectors(corners: Tensor) -> Tensor:
