@@ -182,6 +182,14 @@ def test_transformed_steps() -> None:
     assert torch.equal(mapped[:, 0], expected)
     compiled = torch.compile(step, fullgraph=True, backend="aot_eager")
     assert torch.equal(compiled(*state, wind), expected)
+
+    def play(x: Tensor, v: Tensor, air: Tensor) -> Tensor:
+        track: pd.Track = sim.rollout(pd.State(x, v), 2, targets={case.wind: air})
+        return track.positions
+
+    assert torch.equal(torch.compile(play, fullgraph=True, backend="aot_eager")(*state, wind), play(*state, wind))
+    of_each = torch.func.vmap(lambda air: torch.func.functional_call(sim, {"wind": air}, (state,)).positions)(wind)
+    assert torch.equal(of_each[1, 1], expected[1])
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(step(*state, wind), expected)
     slopes = []

@@ -38,6 +38,7 @@ class Simulator(Stepper):
         gravity        [3] m/s^2                        damping        [] 1/s
         pin_stiffness  [P] N/m                          pin_targets    [P, 3] m
         planes         [C, 5] normal, height, friction  spheres        [S, 8] centre, radius, friction, motion of a step
+        pressure       [n] Pa, at the rest volume       wind           [3] m/s
 
     The buffer `pin_hard` [P] or [B, P] says which pins hold exactly; change it to release and to grasp. `set_material`
     checks and replaces all of these. The rest shape is compiled and has no gradient.

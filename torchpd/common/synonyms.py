@@ -80,6 +80,16 @@ SYNONYMS: dict[str, dict[str, str]] = {
         "up": "`normal` points to the free side",
     },
     "Sphere": {"centre pos position": "the middle is `center` [3] in m", "r": "`radius` is in m", "mu": _FRICTION},
+    "Pressure": {
+        "p p0 pressure": "the overpressure is `pascals`",
+        "cloth solid": "what it pushes is `body`",
+        "faces surface": "the surface of the gas is `triangles` [F, 3]",
+    },
+    "Wind": {
+        "speed v wind": "the velocity of the wind is `velocity` [3] in m/s",
+        "Cd c coefficient drag_coefficient": "the coefficient is `drag`",
+        "rho": "`density` is that of the air [kg/m^3]",
+    },
     "Gravity": {"acceleration g value": "the acceleration is `vector` [3] in m/s^2"},
     "Damping": {"coefficient damping": "the drag is `rate` [1/s]"},
     "Scene": {

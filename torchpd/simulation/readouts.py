@@ -4,6 +4,8 @@ At a solved step the gradient g of its objective without pins equals the forces 
 
     g = m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + elastic gradient = contacts + pins.
 
+The forces include those of pressure and wind at the start of the step.
+
 Pins. A hard one puts g on its vertex, a soft one k (target - x'). The rest r = g - pins is left for the contacts.
 
 Ties. One puts k (point - x') on its vertex. Being elastic, it is part of the gradient g, not of the balance.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, NoReturn, Protocol
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 import torch
 from torch import Tensor
@@ -16,6 +16,9 @@ from ..plan.material import CORE_ROWS
 from ..scene.targets import Anchors, Targets
 from .state import Info, State, Track
 from .surface_loads import SurfaceLoads
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
 
 __all__ = ["PerStep", "Rollout", "run_rollout"]
 
@@ -75,7 +78,7 @@ class Rollout:
 
 def run_rollout(sim: Steps, call: Rollout, *, progress: bool) -> Track:
     """Run a rollout and return the recorded states."""
-    forces = sim.check_state(call.state, forces=None if callable(call.forces) else call.forces, fix=STEPS_DIFFER)
+    forces = sim.check_state(call.state, forces=None if _is_function(call.forces) else call.forces, fix=STEPS_DIFFER)
     material = _first_material(sim, call)
     if progress:
         with tqdm(total=call.steps, desc="simulating", unit="step", leave=False) as bar:
@@ -99,15 +102,15 @@ def _in_chunks(
     Between chunks the bar moves, and Ctrl-C is noticed on a GPU.
     """
     adaptive = not _changes(sim, call)
-    targets = None if callable(call.targets) else call.targets
+    targets = None if _is_function(call.targets) else call.targets
     chunks, state, done, steps, size = [], call.state, 0, 0, 1
     while done < call.steps:
-        if callable(call.targets):
+        if _is_function(call.targets):
             targets = call.targets(call.first + done)
             material = _material_after(sim, material, targets, state[0].shape[0])
         elif done:
             material = _moved_on(material, steps)
-        if callable(call.forces):
+        if _is_function(call.forces):
             forces = sim.check_state(state, forces=call.forces(call.first + done))
         # whole intervals between records, or a part of one
         left = call.every - done % call.every
@@ -138,7 +141,12 @@ def _in_chunks(
 
 def _changes(sim: Steps, call: Rollout) -> bool:
     """Whether inputs change between steps: functions of the step number, and loads, which follow the state."""
-    return callable(call.forces) or callable(call.targets) or sim.loads is not None
+    return _is_function(call.forces) or _is_function(call.targets) or sim.loads is not None
+
+
+def _is_function(given: Any) -> TypeIs[PerStep]:
+    """Whether forces or targets are a function of the step number; torch.compile cannot ask `callable` of a mapping."""
+    return not isinstance(given, Tensor | Mapping) and callable(given)
 
 
 def _finish(device: torch.device) -> float:
@@ -154,7 +162,7 @@ def _finish(device: torch.device) -> float:
 def _first_material(sim: Steps, call: Rollout) -> list[Tensor]:
     """Material of the first step or, if targets are a function, of the step before it."""
     batch = call.state[0].shape[0]
-    if callable(call.targets):
+    if _is_function(call.targets):
         # for the positions of its spheres only
         return sim.material_at(call.targets(call.first - 1), batch) if call.first else sim.material()
     material = sim.material_at(call.targets, batch, fix=STEPS_DIFFER)

@@ -158,6 +158,8 @@ class Stepper(Readable):
     ) -> Track:
         """Advance a state by many time steps and record some of them.
 
+        A scene with pressure or wind takes step by step, with the forces at the start of each.
+
         A constant target of a sphere with a velocity moves on with it. If a function gives centres without velocities,
         these are the displacements since the step before. The sphere then starts from its place in the scene, at step 0
         and after steps whose targets leave it out.

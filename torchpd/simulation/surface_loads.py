@@ -33,7 +33,8 @@ class _Corners(torch.autograd.Function):
 
     @staticmethod
     def forward(values: Tensor, triangles: Tensor, around: Tensor) -> Tensor:
-        return values[:, triangles]
+        found: Tensor = values.index_select(1, triangles.flatten()).unflatten(1, triangles.shape)
+        return found
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
@@ -53,10 +54,10 @@ class _Gathered(torch.autograd.Function):
     def forward(values: Tensor, triangles: Tensor, around: Tensor) -> Tensor:
         rows = values.flatten(1, 2)
         rows = torch.cat([rows, torch.zeros_like(rows[:, :1])], dim=1)
-        total = rows[:, around[:, 0]]
-        for column in range(1, around.shape[1]):
-            total = total + rows[:, around[:, column]]
-        return total
+        first, *others = (rows.index_select(1, column) for column in around)
+        for other in others:
+            first = first + other
+        return first
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
@@ -72,7 +73,7 @@ class _Surface:
     """Triangles of a scene, and the corners around each vertex."""
 
     triangles: Tensor  # [F, 3]
-    around: Tensor  # [V, k] of 3 f + corner; 3 F where there are fewer
+    around: Tensor  # [k, V] of 3 f + corner; 3 F where there are fewer
 
     @staticmethod
     def of(triangles: Index, vertices: int, device: torch.device) -> _Surface:
@@ -80,8 +81,8 @@ class _Surface:
         order = np.argsort(corners, kind="stable")
         counts = np.bincount(corners, minlength=vertices)
         rank = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-        around = np.full((vertices, int(counts.max())), len(corners), dtype=np.int64)
-        around[corners[order], rank] = order
+        around = np.full((int(counts.max()), vertices), len(corners), dtype=np.int64)
+        around[rank, corners[order]] = order
         return _Surface(torch.tensor(triangles, device=device), torch.tensor(around, device=device))
 
     def corners(self, values: Tensor) -> Tensor:
