@@ -146,7 +146,8 @@ class Model(nn.Module):
             self.loads = SurfaceLoads.of(scene, dtype, self.device)
         self._refresh_pin_mask()
         warn_of_scene(scene)
-        warn_of_loads(self)
+        if self.loads is not None:
+            warn_of_loads(self.compiled, self.loads)
         if device is not None:  # first, since "auto" chooses for it
             self.to(device)
         if is_auto(solver):
