@@ -31,7 +31,7 @@ class Loaded:
     """A balloon above rough ground and a held sheet in the wind, and the same scene without loads."""
 
     def __init__(self, dtype: torch.dtype = torch.float32, **settings: Any) -> None:
-        balloon, sheet = octahedron(), cloth(surface(cells=(2, 3)))
+        balloon, sheet = octahedron(), cloth(surface(cells=(2, 3), alternating=False))
         pin = pd.Pin(sheet, sheet.surface.vertices[:, 0] == 0.0)
         self.gas = pd.Pressure(balloon, 40.0, gas=True, ambient=300.0)
         self.suction = pd.Pressure(balloon, -10.0)
@@ -151,6 +151,9 @@ def test_pressure_and_wind_are_material() -> None:
     assert same_bits(
         sim(state), case.sim(state, targets={case.gas: sixty, case.suction: sixty, case.wind: air.detach()})
     )
+    found = sim(state, targets={case.suction: torch.tensor(-7.0, dtype=torch.float64)})
+    pressure = torch.tensor([[50.0, -7.0], [60.0, -7.0]], dtype=torch.float64)
+    assert same_bits(found, torch.func.functional_call(sim, {"pressure": pressure}, (state,)))
     with pytest.raises(ValueError, match="state must have as many environments as the simulator's pressure, 2, got 3"):
         sim(case.state(3))
     with pytest.raises(TypeError, match=r"no array 'wind'; .*the scene has no wind"):
@@ -200,10 +203,11 @@ def test_transformed_steps() -> None:
     plain = sim(state)
     assert same_bits(copy.deepcopy(sim)(state), plain)
     assert same_bits(pickle.loads(pickle.dumps(sim))(state), plain)
-    wide = copy.deepcopy(sim).double()
-    difference = wide(pd.State(*(part.double() for part in state))).positions - plain.positions
-    assert wide.wind.dtype == torch.float64
-    assert float(difference.abs().max()) < 1e-5
+    made, wide = Loaded(torch.float64), copy.deepcopy(sim).double()
+    wide.set_material(masses=made.sim.masses)
+    strong = torch.tensor([0.0, 400.0, 0.0], dtype=torch.float64)  # bounded by masses
+    loads = wide.load_forces(made.state(), {case.wind: strong})
+    assert torch.equal(loads, made.sim.load_forces(made.state(), {made.wind: strong}))
 
 
 def test_a_balloon_grows_to_its_equilibrium() -> None:
@@ -250,9 +254,21 @@ def test_the_converged_step_has_the_loads() -> None:
         np.testing.assert_allclose(step.solution, moved, atol=1e-8)
         own = problem_of(case.bare, state, number, forces=sim.load_forces(state, targets))
         np.testing.assert_array_equal(problem_of(sim, state, number, targets=targets).target, own.target)
-    found = sim.tune(state, error=0.05, targets=targets, candidates=[pd.Multilevel()])
+
+
+def test_tune_has_the_loads() -> None:
+    """There is no motion but that by the wind of the targets."""
+    sheet, wind = cloth(surface(cells=(3, 3))), pd.Wind((0.0, 0.0, 0.0))
+    pin = pd.Pin(sheet, sheet.surface.vertices[:, 0] == 0.0)
+    sim = pd.Simulator(pd.Scene(sheet, pin, wind), dtype=torch.float64)
+    with pytest.raises(ValueError, match="no motion that needs solving"):
+        sim.tune(error=0.05)
+    breeze = torch.tensor([[0.0, 2.0, 0.0], [1.0, 4.0, 0.0]], dtype=torch.float64)
+    found = sim.tune(sim.rest_state(2), error=0.05, targets={wind: breeze}, candidates=[pd.Chebyshev()])
+    assert found.attained
     assert found.matches(sim)
-    sim.set_material(wind=torch.tensor([9.0, 0.0, 0.0]))
+    with torch.no_grad():
+        sim.wind.add_(1.0)
     assert not found.matches(sim)
 
 
