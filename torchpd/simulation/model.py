@@ -458,6 +458,8 @@ class Model(nn.Module):
                 # the material may have been trained, so it keeps its digits
                 report_resolution(self.scene, wanted.dtype)
                 self.rest_positions = torch.tensor(self.scene.rest_positions, dtype=wanted.dtype, device=wanted.device)
+                if (contraction := self.anchors.contraction) is not None:
+                    self.fibre_contraction = torch.tensor(contraction, dtype=wanted.dtype, device=wanted.device)
         self._refresh_pin_mask()
         if chooses:
             with persistent_tensors():
