@@ -55,7 +55,7 @@ def nearest_rotation_fast(matrices: Array, *, sweeps: int = 9) -> Array:
     Higham's Newton iteration X <- (X + X^-T) / 2 converges quadratically to the rotation of the polar decomposition
     when det F > 0 (Higham 1986). The SVD handles matrices for which it has not converged to rounding.
     """
-    x = np.ascontiguousarray(np.moveaxis(matrices, 0, 2))
+    x = np.array(np.moveaxis(matrices, 0, 2), order="C")  # a copy, also for n = 1
     scale = np.abs(x).max(axis=(0, 1)) ** 3
     sound = (x[0] * _cofactors(x)[0]).sum(axis=0) > 1e-3 * scale
     x[:, :, ~sound] = np.eye(3)[:, :, None]
