@@ -11,18 +11,20 @@ energy in joules; stresses and second derivatives are multiplied by the measure 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .rotations import LEAST, nearest_orthonormal, orthonormal_differential, singular_frames
+from .rotations import LEAST, nearest_orthonormal, orthonormal_linearised, singular_frames
 
-__all__ = ["Corotated", "Coupling", "Damped", "Law", "Length"]
+__all__ = ["Corotated", "Coupling", "Damped", "Law", "Length", "Linear"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
+Linear = Callable[[Array], Array]
 
 
 def inner(a: Array, b: Array) -> Array:
@@ -69,8 +71,8 @@ class Law(ABC):
         """Energies [N] in J and V P [N, 3, d]."""
 
     @abstractmethod
-    def differential(self, F: Array, dF: Array) -> Array:
-        """V dP [N, 3, d] along dF."""
+    def linearised(self, F: Array) -> Linear:
+        """The map of dF to V dP at F, without `coupling`."""
 
     @abstractmethod
     def rates(self, F: Array) -> dict[str, Array]:
@@ -80,27 +82,32 @@ class Law(ABC):
     def products(self, F: Array, dF: Array) -> dict[str, Array]:
         """Derivative of `rates` along dF: the derivative of sum V P : dF by every parameter, [N] each."""
 
+    def differential(self, F: Array, dF: Array) -> Array:
+        """V dP [N, 3, d] along dF."""
+        own, joined = self.linearised(F)(dF), self.coupling(F)
+        if joined is None:
+            return own
+        sums = np.bincount(joined.group, weights=inner(joined.rows, dF))
+        return np.asarray(own + scaled((joined.factor * sums)[joined.group], joined.rows))
+
     def blocks(self, F: Array, *, positive: bool) -> Array:
         """Second derivative of each element by itself [N, 3 d, 3 d], in the order of F^T, less `coupling`.
 
         `positive` clamps negative eigenvalues at zero.
         """
         count, _, width = F.shape
-        columns = []
-        for number in range(3 * width):
-            dF = np.zeros_like(F)
-            dF[:, number // width, number % width] = 1.0
-            columns.append(np.swapaxes(self._own_differential(F, dF), 1, 2).reshape(count, -1))
-        order = np.arange(3 * width).reshape(3, width).T.reshape(-1)
-        blocks = np.stack(columns, axis=2)[:, :, order]
+        along, columns = self.linearised(F), []
+        for k in range(width):
+            for i in range(3):
+                dF = np.zeros_like(F)
+                dF[:, i, k] = 1.0
+                columns.append(np.swapaxes(along(dF), 1, 2).reshape(count, -1))
+        blocks = np.stack(columns, axis=2)
         blocks = 0.5 * (blocks + np.swapaxes(blocks, 1, 2))
         if not positive:
             return blocks
         values, vectors = np.linalg.eigh(blocks)
         return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2))
-
-    def _own_differential(self, F: Array, dF: Array) -> Array:
-        return self.differential(F, dF)
 
     def coupling(self, F: Array) -> Coupling | None:
         """The part of the second derivative that `blocks` lacks."""
@@ -188,15 +195,11 @@ class Corotated(Law):
             stress = stress + scaled(bulk * p[self.members], R)
         return energies, stress
 
-    def _own_differential(self, F: Array, dF: Array) -> Array:
-        R, dR = nearest_orthonormal(F), orthonormal_differential(F, dF)
-        p = self._pressure(F, R)[2][self.members]
-        return np.asarray(scaled(self.shear * self.measure, dF - dR) + scaled(self.bulk * self.measure * p, dR))
-
-    def differential(self, F: Array, dF: Array) -> Array:
-        own, joined = self._own_differential(F, dF), self.coupling(F)
-        sums = np.bincount(joined.group, weights=inner(joined.rows, dF))
-        return np.asarray(own + scaled((joined.factor * sums)[joined.group], joined.rows))
+    def linearised(self, F: Array) -> Linear:
+        p = self._pressure(F, nearest_orthonormal(F))[2][self.members]
+        shear, pressure = self.shear * self.measure, self.bulk * self.measure * p
+        turn = orthonormal_linearised(F)
+        return lambda dF: scaled(shear, dF) - scaled(shear - pressure, turn(dF))
 
     def coupling(self, F: Array) -> Coupling:
         R = nearest_orthonormal(F)
@@ -282,10 +285,10 @@ class Length(Law):
         length, unit, weight = self._direction(F)
         return 0.5 * weight * (length - self.length) ** 2, scaled(weight, F - scaled(self.length, unit))
 
-    def differential(self, F: Array, dF: Array) -> Array:
+    def linearised(self, F: Array) -> Linear:
         length, unit, weight = self._direction(F)
-        across = dF - scaled(inner(unit, dF), unit)
-        return np.asarray(scaled(weight, dF) - scaled(weight * self.length / np.maximum(length, LEAST), across))
+        across = weight * self.length / np.maximum(length, LEAST)
+        return lambda dF: scaled(weight - across, dF) + scaled(across * inner(unit, dF), unit)
 
     def rates(self, F: Array) -> dict[str, Array]:
         length, _, weight = self._direction(F)
@@ -319,9 +322,9 @@ class Damped(Law):
         stress = scaled(self.stiffness * self.measure, apart)
         return 0.5 * inner(stress, apart), stress
 
-    def differential(self, F: Array, dF: Array) -> Array:
-        turned = orthonormal_differential(F @ self.target, dF @ self.target) @ self.target
-        return scaled(self.stiffness * self.measure, dF - turned)
+    def linearised(self, F: Array) -> Linear:
+        turn, weight = orthonormal_linearised(F @ self.target), self.stiffness * self.measure
+        return lambda dF: scaled(weight, dF - turn(dF @ self.target) @ self.target)
 
     def rates(self, F: Array) -> dict[str, Array]:
         apart = F - nearest_orthonormal(F @ self.target) @ self.target

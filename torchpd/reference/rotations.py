@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,7 +13,7 @@ __all__ = [
     "nearest_orthonormal",
     "nearest_rotation",
     "nearest_rotation_fast",
-    "orthonormal_differential",
+    "orthonormal_linearised",
     "singular_frames",
 ]
 
@@ -101,24 +103,38 @@ def nearest_orthonormal(matrices: Array) -> Array:
     return nearest_rotation_fast(matrices) if matrices.shape[2] == 3 else nearest_frame(matrices)[0]
 
 
-def orthonormal_differential(matrices: Array, change: Array) -> Array:
-    """Derivative of `nearest_orthonormal` along dF.
+def orthonormal_linearised(matrices: Array) -> Callable[[Array], Array]:
+    """The derivative of `nearest_orthonormal`: a map of dF.
 
     d = 3: U W V^T with W_ij = (M_ij - M_ji) / (s_i + s_j) and M = U^T dF V (Papadopoulo and Lourakis 2000). d = 2: the
     turn about the normal, and the tilt n (n^T dF) S^-1 with S = R^T F.
     """
-    if matrices.shape[2] == 3:
-        left, values, right = singular_frames(matrices)
+    return _rotation_linearised(matrices) if matrices.shape[2] == 3 else _frame_linearised(matrices)
+
+
+def _rotation_linearised(matrices: Array) -> Callable[[Array], Array]:
+    left, values, right = singular_frames(matrices)
+    sums = np.maximum(values[:, :, None] + values[:, None, :], LEAST)
+
+    def along(change: Array) -> Array:
         inner = np.swapaxes(left, 1, 2) @ change @ np.swapaxes(right, 1, 2)
-        sums = np.maximum(values[:, :, None] + values[:, None, :], LEAST)
         return np.asarray(left @ ((inner - np.swapaxes(inner, 1, 2)) / sums) @ right)
+
+    return along
+
+
+def _frame_linearised(matrices: Array) -> Callable[[Array], Array]:
     frame, normal, h = nearest_frame(matrices)
     squares = np.swapaxes(matrices, 1, 2) @ matrices
     trace = np.trace(squares, axis1=1, axis2=2)
     area = np.maximum(0.5 * (h**2 - trace), LEAST * np.maximum(trace, LEAST))
     h = np.maximum(h, LEAST)
-    turn = ((frame[..., 1] * change[..., 0]).sum(axis=1) - (frame[..., 0] * change[..., 1]).sum(axis=1)) / h
     inverse = ((trace + area)[:, None, None] * np.eye(2) - squares) / (area * h)[:, None, None]
-    tilt = np.einsum("ni,nji->nj", np.einsum("nk,nki->ni", normal, change), inverse)
-    turned = np.stack([frame[..., 1], -frame[..., 0]], axis=2) * turn[:, None, None]
-    return np.asarray(turned + normal[:, :, None] * tilt[:, None, :])
+    turned = np.stack([frame[..., 1], -frame[..., 0]], axis=2)
+
+    def along(change: Array) -> Array:
+        turn = ((frame[..., 1] * change[..., 0]).sum(axis=1) - (frame[..., 0] * change[..., 1]).sum(axis=1)) / h
+        tilt = np.einsum("nk,nki,nji->nj", normal, change, inverse)
+        return np.asarray(turned * turn[:, None, None] + normal[:, :, None] * tilt[:, None, :])
+
+    return along

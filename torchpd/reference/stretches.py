@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .laws import Law, inner, scaled
+from .laws import Law, Linear, inner, scaled
 from .rotations import LEAST, singular_frames
 
 __all__ = ["Limit", "Stretches", "Volume", "nearest_unit_volume"]
@@ -50,28 +50,32 @@ class Stretches(Law):
         weight = self.stiffness * self.measure
         return 0.5 * weight * (apart**2).sum(axis=1), scaled(weight, _assembled(left, apart, right))
 
-    def differential(self, F: Array, dF: Array) -> Array:
+    def linearised(self, F: Array) -> Linear:
         """dZ = U M' V^T with M = U^T dF V: the diagonal by `slopes`, other entries by quotients.
 
         The symmetric part of a pair has (z_i - z_j) / (s_i - s_j), the antisymmetric part (z_i + z_j) / (s_i + s_j).
         """
         left, s, right = _frames(F)
         z, width = self.nearest(s), s.shape[1]
-        slopes = self.slopes(s, z)
-        moved = np.swapaxes(left, 1, 2) @ dF @ np.swapaxes(right, 1, 2)
-        square = moved[:, :width]
-        turned = np.swapaxes(square, 1, 2)
+        slopes, diagonal = self.slopes(s, z), np.arange(width)
         apart = s[:, :, None] - s[:, None, :]
         equal = np.abs(apart) <= 1e-9 * np.maximum(np.abs(s[:, :1, None]), 1.0)
         own = np.einsum("nii->ni", slopes)[:, :, None]
         quotient = np.where(equal, own - slopes, (z[:, :, None] - z[:, None, :]) / np.where(equal, 1.0, apart))
         sums = (z[:, :, None] + z[:, None, :]) / np.maximum(s[:, :, None] + s[:, None, :], LEAST)
-        inside = 0.5 * (quotient * (square + turned) + sums * (square - turned))
-        diagonal = np.arange(width)
-        inside[:, diagonal, diagonal] = np.einsum("nij,njj->ni", slopes, square)
-        out = moved[:, width:] * (z / np.maximum(s, LEAST))[:, None]
-        change = left @ np.concatenate([inside, out], axis=1) @ right
-        return scaled(self.stiffness * self.measure, dF - change)
+        outside = (z / np.maximum(s, LEAST))[:, None]  # of the normal, for d = 2
+        weight = self.stiffness * self.measure
+
+        def along(dF: Array) -> Array:
+            moved = np.swapaxes(left, 1, 2) @ dF @ np.swapaxes(right, 1, 2)
+            square = moved[:, :width]
+            turned = np.swapaxes(square, 1, 2)
+            inside = 0.5 * (quotient * (square + turned) + sums * (square - turned))
+            inside[:, diagonal, diagonal] = np.einsum("nij,njj->ni", slopes, square)
+            change = left @ np.concatenate([inside, moved[:, width:] * outside], axis=1) @ right
+            return scaled(weight, dF - change)
+
+        return along
 
     def rates(self, F: Array) -> dict[str, Array]:
         _, values, _ = _frames(F)
