@@ -118,9 +118,9 @@ class Law(ABC):
 class Corotated(Law):
     """Corotated elasticity of tetrahedra and membranes, the pressure in tension capped at 2 mu.
 
-    E = mu V |F - R|^2 + B phi(t), t the mean of tr(R^T F) - d over a group with weights lambda V, B their sum,
-    phi(t) = t^2 / 2 up to c and c t - c^2 / 2 beyond, c the least 2 mu / lambda of the group. P = 2 mu (F - R) + p R
-    with p = lambda min(t, c). An element with lambda <= 0 has its own trace, without a cap.
+    E = mu V |F - R|^2 + B phi(t). t is the mean of tr(R^T F) - d over a group with weights lambda V, B their sum.
+    phi(t) = t^2 / 2 up to c, and c t - c^2 / 2 beyond, with c the least 2 mu / lambda of the group. Then
+    P = 2 mu (F - R) + p R with p = lambda min(t, c). An element with lambda <= 0 has its own trace, without a cap.
     """
 
     shear: Array  # [N] 2 mu

@@ -53,8 +53,9 @@ def flowed(group: StencilGroup, plastic: Array) -> StencilGroup:
 def flow(law: PlasticLaw, elastic: Array, state: Flow, time_step: float) -> Flow:
     """The state after a step that ended with F_e [N, 3, 3].
 
-    With F_e = U S V^T, d the deviator of log S and n = d / |d|: gamma = max(0, |d| - (yield + H alpha)) / (1 + H) times
-    the share of creep, Fp <- V exp(gamma n) V^T Fp and alpha <- alpha + gamma. Nothing flows where det F_e <= 0.
+    With F_e = U S V^T, d is the deviator of log S and n = d / |d|. The flow gamma of the step is the share of creep
+    times max(0, |d| - (yield + H alpha)) / (1 + H). Then Fp <- V exp(gamma n) V^T Fp and alpha <- alpha + gamma.
+    Nothing flows where det F_e <= 0.
     """
     _, values, right = singular_frames(elastic)
     sound = values[:, 2] > 0.0
@@ -82,8 +83,8 @@ def _bounded(plastic: Array, most: float) -> Array:
 def flow_product(law: PlasticLaw, elastic: Array, change: Array, state: Flow, time_step: float) -> Array:
     """Derivative of D = V exp(gamma n) V^T [N, 3, 3] along dF_e, at a fixed state and without the bound of Fp.
 
-    In the frame V of C = F_e^T F_e = V diag(c) V^T: D' has C'_ij (f_i - f_j) / (c_i - c_j) off the diagonal, with
-    f = exp(x) and x = gamma n, and f_i x_i' on it, where e_i' = C'_ii / 2 c_i changes the strains.
+    In the frame V of C = F_e^T F_e = V diag(c) V^T, with f = exp(x) and x = gamma n: D' has C'_ij (f_i - f_j) /
+    (c_i - c_j) off its diagonal and f_i x_i' on it. There, e_i' = C'_ii / 2 c_i changes the strains.
     """
     _, values, right = singular_frames(elastic)
     back = np.swapaxes(right, 1, 2)
