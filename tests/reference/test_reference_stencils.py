@@ -18,7 +18,6 @@ from stencil_scenes import (
     SOLID_CASES,
     SolidCase,
     StencilScene,
-    StencilValues,
     bare_values,
     capped_box,
     chain,
@@ -34,13 +33,13 @@ from stencil_scenes import (
     sheet,
     small_beam,
     springs,
-    with_stencils,
 )
 
 from torchpd.reference import Array, StepProblem, elastic_energy, elements, step_problem
 from torchpd.reference.groups import ElementGroup
 from torchpd.reference.laws import Corotated
 from torchpd.reference.solvers import guarded_chebyshev, jacobi, newton, preconditioned_lbfgs, relative_error
+from torchpd.scene import SceneValues
 
 SCENES: dict[str, Callable[[], StencilScene]] = {
     "spring": pulled_spring,
@@ -164,7 +163,7 @@ def every_kind(seed: int = 0) -> tuple[StepProblem, Array]:
         of_tets("damper", values, np.arange(count), viscosity=1e3),
         of_tets("plastic", values, np.arange(5), plastic_youngs=1e5, plastic_poisson=0.3),
     )
-    mixed = with_stencils(
+    mixed = replace(
         values,
         stencils=groups,
         stiffness=1e5 * size,
@@ -209,9 +208,8 @@ def test_material_products_are_derivatives_of_the_gradient() -> None:
     problem, u = every_kind()
     v = np.random.default_rng(2).standard_normal(u.shape)
     products, values = problem.material_products(u, v), problem.values
-    assert isinstance(values, StencilValues)
 
-    def along(values: StencilValues) -> float:
+    def along(values: SceneValues) -> float:
         return float((replace(problem, values=values).gradient(u) * v).sum())
 
     for stencils in values.stencils:
@@ -286,7 +284,7 @@ def test_joined_components_have_no_rigid_motion_of_their_own() -> None:
     scene = chain()
     halves = (np.arange(21) > 10).astype(np.int64)
     apart = bare_values(scene.values.rest_positions, scene.values.masses, (), np.array([0]), component=halves)
-    joined = with_stencils(apart, stencils=scene.problem().values.stencils)
+    joined = replace(apart, stencils=scene.problem().values.stencils)
     problem = step_problem(joined, joined.rest_positions, scene.velocities, scene.time_step)
     assert problem.joined.tolist() == [True, True]
     guess = 0.001 * np.random.default_rng(0).standard_normal((21, 3))
