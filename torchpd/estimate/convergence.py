@@ -30,7 +30,6 @@ from ..geometry.mesh_quality import smallest_dihedral
 from ..geometry.tet_mesh import TetMesh
 from ..ops.diagonal import step_diagonal
 from ..plan.compiled import CompiledScene
-from ..scene.effects import Solid
 from ..scene.solvers import Chebyshev, Multilevel, Solver
 
 __all__ = [
@@ -40,7 +39,6 @@ __all__ = [
     "forecast",
     "has_contacts",
     "has_friction",
-    "has_thin_bodies",
     "held_up_by",
     "is_bound",
     "is_uneven",
@@ -143,7 +141,7 @@ def forecast(
     numbers = solver.settings()
     if spectrum is None or not numbers["weighted"]:
         return None
-    if isinstance(solver, Multilevel) and not (has_contacts(compiled) or has_thin_bodies(compiled)):
+    if isinstance(solver, Multilevel) and not (has_contacts(compiled) or compiled.has_stencils):
         largest = max(len(body.mesh.vertices) for body in compiled.scene.bodies)
         reach = min(spectrum.slow * largest ** (2.0 / 3.0), 1.0)
         decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
@@ -167,17 +165,12 @@ def forecast(
 
 def is_bound(compiled: CompiledScene) -> bool:
     """Whether the estimate is an upper bound that most steps stay far below."""
-    return isinstance(compiled.solver, Multilevel) and (has_contacts(compiled) or has_thin_bodies(compiled))
+    return isinstance(compiled.solver, Multilevel) and (has_contacts(compiled) or compiled.has_stencils)
 
 
 def has_contacts(compiled: CompiledScene) -> bool:
     """Whether the scene has planes or spheres."""
     return compiled.named["planes"].shape[-2] + compiled.named["spheres"].shape[-2] > 0
-
-
-def has_thin_bodies(compiled: CompiledScene) -> bool:
-    """Whether the scene has cloth or rods, which buckle."""
-    return any(not isinstance(body, Solid) for body in compiled.scene.bodies)
 
 
 def is_uneven(compiled: CompiledScene) -> bool:
@@ -203,9 +196,9 @@ def has_friction(compiled: CompiledScene) -> bool:
 
 
 def held_up_by(compiled: CompiledScene) -> str:
-    """Obstacle to the convergence of `Multilevel`: "friction", "a ball" (sheets buckle over it), "a thin body", ""."""
+    """Obstacle to the convergence of `Multilevel`: other parts than solids, friction, a ball (sheets buckle), or ""."""
+    if compiled.has_stencils:
+        return "a part besides solids"
     if has_friction(compiled):
         return "friction"
-    if compiled.named["spheres"].shape[-2]:
-        return "a ball"
-    return "a thin body" if has_thin_bodies(compiled) else ""
+    return "a ball" if compiled.named["spheres"].shape[-2] else ""
