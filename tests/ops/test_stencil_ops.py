@@ -11,6 +11,7 @@ from stencil_scenes import bare_values, chain, pulled_spring
 from torch import Tensor
 
 from torchpd.common.tables import KINDS, MATERIAL_TABLE
+from torchpd.ops.diagonal import named_material
 from torchpd.plan.cpu_plan import compile_plan
 from torchpd.plan.material import effect_rows, material_of, material_rows
 from torchpd.reference.groups import ElementGroup
@@ -203,8 +204,6 @@ def test_rows_follow_the_table(scene: object) -> None:
     """Arrays that a scene lacks are empty, and the others stand in the order of the table."""
     values = scene().values  # type: ignore[operator]
     assert list(effect_rows(values)) == ["spring_stiffness", "rest_length"]
-    rows = dict(
-        zip([row.name for row in MATERIAL_TABLE], material_rows(material_of(values, torch.float64)), strict=True)
-    )
+    rows = named_material(material_rows(material_of(values, torch.float64)))
     assert rows["thickness"].numel() == 0
     assert rows["rest_length"].tolist() == values.stencils[0].material["rest_length"].tolist()

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from runs import ULP
 from stencil_scenes import (
     FIRM_CLOTH,
     MUSCLE_BEAMS,
