@@ -39,6 +39,8 @@ class Simulator(Stepper):
         pin_stiffness  [P] N/m                          pin_targets    [P, 3] m
         planes         [C, 5] normal, height, friction  spheres        [S, 8] centre, radius, friction, motion of a step
 
+    Scenes with cloth, rods, springs, ties, fibres or a Poisson's ratio have further arrays, see docs/materials.md.
+
     The buffer `pin_hard` [P] or [B, P] says which pins hold exactly; change it to release and to grasp. `set_material`
     checks and replaces all of these. The rest shape is compiled and has no gradient.
 
@@ -46,7 +48,7 @@ class Simulator(Stepper):
     brings NaN, or negative stiffness, masses or springs, `Info.residual` is NaN (`Info` names the exceptions). So let
     an optimiser learn the logarithm of positive quantities.
 
-    Guides: docs/quickstart.md, docs/solvers.md (solver, iterations, tolerance), docs/gpu.md (kernel, batch).
+    Guides: docs/quickstart.md, docs/materials.md, docs/solvers.md (solver, iterations, tolerance), docs/gpu.md (kernel, batch).
 
     Args:
         scene: bodies and effects.
