@@ -48,7 +48,7 @@ class Simulator(Stepper):
     brings NaN, or negative stiffness, masses or springs, `Info.residual` is NaN (`Info` names the exceptions). So let
     an optimiser learn the logarithm of positive quantities.
 
-    Guides: docs/quickstart.md, docs/materials.md, docs/solvers.md (solver, iterations, tolerance), docs/gpu.md (kernel).
+    Guides: docs/quickstart.md, docs/materials.md, docs/solvers.md (solver, iterations, tolerance), docs/gpu.md.
 
     Args:
         scene: bodies and effects.
