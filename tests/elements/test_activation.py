@@ -43,6 +43,7 @@ def test_no_length_is_negative() -> None:
     sim, upper, _ = muscle()
     state, much = sim.rest_state(), torch.tensor(9.0, dtype=torch.float64)
     assert torch.equal(sim(state, targets={upper: much}).positions, sim(state, targets={upper: much + 1}).positions)
+    assert torch.equal(sim.energy(state, {upper: much}), sim.energy(state, {upper: much + 1}))
 
 
 @pytest.mark.parametrize("shape", [(4,), (2, 5), (3, 4), (3, 3, 5)])

@@ -23,7 +23,7 @@ def rod(points: np.ndarray) -> pd.Rod:
 def test_a_straight_tube_is_a_closed_prism() -> None:
     """Area of a regular polygon times the length; every ring vertex lies at the radius."""
     skin = SceneSurface(pd.Scene(rod(np.linspace((0, 0, 0), (0.3, 0.4, 1.2), 5))), sides=SIDES)
-    points = np.linspace((1.0, 0, 0), (1, 0, 1.3), 5)
+    points = np.linspace((1.0, 0, 0.5), (1, 0, 1.8), 5)
     drawn = skin.apply(points)
     assert drawn.shape == (5 * SIDES, 3)
     area = 0.5 * SIDES * np.sin(2.0 * np.pi / SIDES) * RADIUS**2
