@@ -13,7 +13,7 @@ from torchpd.accuracy.error import exact_steps, problem_of
 
 def test_the_reference_has_the_present_material_of_every_kind() -> None:
     """Gradients of the objective agree, for environments of their own and an activation of the step."""
-    solid = pd.Solid(pd.shapes.box((1, 0.3, 0.3), (1, 1, 1)), 1e5)
+    solid = pd.Solid(pd.shapes.box((1, 0.3, 0.3), (1, 1, 1)), 1e5, poisson=0.3)
     sheet = cloth(bending=1e-3, warp=20.0, grain=(1.0, 0.0, 0.0))
     rod = pd.Rod([[0.0, 1, 0], [0.5, 1, 0], [1, 1, 0]], 1e6, 1e-2)
     fibres = pd.Fibres(solid, (1, 0, 0), 1e4)
