@@ -153,8 +153,8 @@ py::dict build_plan(const Doubles& positions, const Indices& tets,
                     const std::function<void(double)>& progress) {
   pd::MeshElements elements = mesh_elements(positions, tets, stencils);
   elements.averaged = tet_groups(tet_group, tets);
-  if (patch_size < 16 || patch_size > 4096)
-    throw py::value_error("patch_size must lie in 16..4096");
+  if (patch_size < 16 || patch_size > 8192)
+    throw py::value_error("patch_size must lie in 16..8192");
   auto plan = pd::build_plan(elements, patch_size, progress);
   py::dict arrays;
   std::map<std::string, int> widths;

@@ -217,7 +217,7 @@ def compile_plan(
     Args:
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
-        patch_size: elements per patch, 16 to 4096; None chooses by mesh size.
+        patch_size: elements per patch, 16 to 8192; None chooses by mesh size.
         progress: show a bar when the mesh is large.
     """
     if dtype not in (torch.float32, torch.float64):

@@ -44,7 +44,8 @@ def check_signs(name: str, poisson: Array, group: Index) -> None:
             tets = np.flatnonzero(group == both[0])
             raise ValueError(
                 f"{name} must have one sign in each group of averaged tetrahedra, got {row[tets].tolist()} in "
-                f"tetrahedra {tets.tolist()} ({both.size} groups in all); give Solid(averaging=) groups of one sign, or 1"
+                f"tetrahedra {tets.tolist()} ({both.size} groups in all); give Solid(averaging=) groups of one sign, "
+                "or 1"
             )
 
 

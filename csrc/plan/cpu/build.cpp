@@ -5,6 +5,8 @@
 #include "plan/mesh/stencils.h"
 
 #include <algorithm>
+#include <limits>
+#include <stdexcept>
 
 namespace pd {
 
@@ -29,6 +31,8 @@ void add_slots(MeshPlan& plan, const Numbering& n, const MeshElements& elements,
     }
   }
   plan.patch_slot.push_back(std::int32_t(plan.slot_vertex.size()));
+  if (plan.slot_vertex.size() - begin > std::numeric_limits<std::int16_t>::max())
+    throw std::invalid_argument("a patch has more vertices than 16 bits count: give a smaller patch_size");
 }
 
 // One lane of a block of tetrahedra.
