@@ -10,9 +10,10 @@ def build_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],
     stencils: list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]],
+    tet_group: NDArray[int64] | None,
     patch_size: int,
     progress: Callable[[float], None],
-) -> dict[str, NDArray[Any]]: ...
+) -> dict[str, Any]: ...
 def build_device_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],

@@ -164,11 +164,17 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.slots = size[plan_slots];
   plan.shared = size[plan_shared];
   plan.most_slots = size[plan_most_slots];
+  plan.members = size[plan_members];
   TORCH_CHECK_VALUE(plan.patches >= 1 && plan.most_slots >= 1 && plan.most_slots <= plan.slots,
                     "plan.sizes must count at least one patch, and no more slots in one than in "
                     "all, got ",
                     plan.patches, " patches with up to ", plan.most_slots, " of ", plan.slots,
                     " slots; compile the scene again");
+  TORCH_CHECK_VALUE((plan.members == 1 || plan.members == 2 || plan.members == 4) &&
+                        plan.blocks % plan.members == 0,
+                    "plan.sizes must have groups of 1, 2 or 4 tetrahedra, and whole groups of "
+                    "blocks, got ",
+                    plan.members, " and ", plan.blocks, " blocks; compile the scene again");
   PlanRows count{};
   count.size = plan_size_count;
   count.vertex = plan.vertices;
@@ -407,6 +413,19 @@ void check_effects(const Plan<T>& plan, at::TensorList material) {
 template <class T>
 void check_effects(const DevicePlan<T>&, at::TensorList) {}
 
+// Whether a material has Poisson's ratio.
+inline bool has_poisson(at::TensorList material) {
+  return material.size() > material_arrays && array_of(material, "poisson").size(-1) > 0;
+}
+
+inline void check_poisson(at::TensorList material, std::int64_t tets) {
+  const Tensor& poisson = array_of(material, "poisson");
+  TORCH_CHECK_VALUE(poisson.dim() >= 1 && (poisson.size(-1) == 0 || poisson.size(-1) == tets),
+                    "material.poisson must be [", tets, "] or [batch, ", tets,
+                    "], one value per tetrahedron of the plan, or [0] in a scene without, got ",
+                    describe(poisson));
+}
+
 // The arrays that only some scenes have.
 template <class P, class T>
 Effects<T> effects_view(const P& plan, at::TensorList arrays, std::int64_t batch,
@@ -414,6 +433,7 @@ Effects<T> effects_view(const P& plan, at::TensorList arrays, std::int64_t batch
   Effects<T> effects;
   check_effects(plan, arrays);
   if (arrays.size() == material_arrays) return effects;
+  check_poisson(arrays, plan.tets);
   int at = material_arrays;
 #define X(name, width, rows, meaning)
 #define EFFECT(name, width, rows, meaning)                                                        \

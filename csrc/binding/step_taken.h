@@ -30,7 +30,7 @@ class SolvedStep {
     call.material = material_view<T>(call.plan, t.material, call.batch, place);
     const Material<T>& m = call.material;
     call.elastic = {keep(diagonal_typed<Backend, T>(t.material, t.plan, true)),
-                    m.stiffness.stride ? call.plan.vertices : 0};
+                    environments_of(t.material) > 1 ? call.plan.vertices : 0};
     touching = m.planes_count + m.spheres_count > 0;
     call.time_step = time_step;
     call.grad_positions = keep(t.grad_positions);

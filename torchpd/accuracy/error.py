@@ -34,6 +34,7 @@ from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
 from ..simulation.state import State
 from ..simulation.surface_loads import SurfaceLoads
+from .candidates import multilevel_for
 from .unsolved_step import ROUNDINGS
 
 if TYPE_CHECKING:
@@ -53,7 +54,8 @@ Array = NDArray[np.float64]
 
 # Solvers of exact steps, with iterations between checks of the residual. The first is the best by far without contacts.
 # With contacts, each solves scenes on which the others stagnate.
-_SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 50), (Multilevel("momentum"), 100), (Chebyshev(), 500))
+_FIRST = 50  # of the schedule that `multilevel_for` names
+_OTHERS: tuple[tuple[Solver, int], ...] = ((Multilevel("momentum"), 100), (Chebyshev(), 500))
 _SOLVED = 1e-13  # residual at which a solver ends
 _NEARLY = 1e-9  # residual that may be the lowest that rounding allows
 _PATIENCE = 3  # checks without a halved residual before a solver ends; one if all are below _NEARLY
@@ -253,7 +255,7 @@ def exact_steps(
     # independent of torch's default device
     with torch.device("cpu"):
         search = _Search(sim, state, forces, targets, start)
-        for solver, chunk in _SOLVERS:
+        for solver, chunk in ((multilevel_for(sim.compiled), _FIRST), *_OTHERS):
             search.iterate(solver, chunk, iterations)
             search.polish(_FINE[sim.dtype])
             if search.sure:
@@ -289,7 +291,10 @@ def settled_steps(
 
         problems = [problem_of(sim, state, item, forces=forces) for item in range(len(wide.positions))]
         first = torch.from_numpy(np.stack([problem.unsolved() for problem in problems]))
-        after, moves = run(Multilevel(), _LEADING), [torch.inf * torch.ones(len(first), dtype=torch.float64)]
+        after, moves = (
+            run(multilevel_for(sim.compiled), _LEADING),
+            [torch.inf * torch.ones(len(first), dtype=torch.float64)],
+        )
         for iterations in _SETTLING:
             before, after = after, run(Chebyshev(), iterations, after.positions)
             # from velocities, because a difference of positions loses digits

@@ -33,7 +33,7 @@ from ..scene.solvers import Chebyshev, Multilevel, Solver
 from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
 from ..simulation.state import State
-from .candidates import safe_candidates
+from .candidates import multilevel_for, safe_candidates
 from .error import ExactStep, exact_steps, settled_steps
 from .tuning_checks import check_known, check_request, check_start
 from .tuning_result import Trial, TuningResult
@@ -263,8 +263,9 @@ def _motion(sim: Stepper, start: State, forces: Tensor | None) -> list[State]:
     states in which the energy is not convex, and all solvers leave these slowly.
     """
     mover = copy.copy(sim)
-    if runs(Multilevel(), mover.compiled) and not has_friction(mover.compiled):
-        mover.solver, mover.iterations = Multilevel(), _MOVING
+    multilevel = multilevel_for(mover.compiled)
+    if runs(multilevel, mover.compiled) and not has_friction(mover.compiled):
+        mover.solver, mover.iterations = multilevel, _MOVING
     else:
         mover.solver, mover.iterations = Chebyshev(), _MOVING_PLAINLY
     prober = copy.copy(mover)

@@ -40,6 +40,8 @@ class Simulator(Stepper):
         planes         [C, 5] normal, height, friction  spheres        [S, 8] centre, radius, friction, motion of a step
         pressure       [n] Pa, at the rest volume       wind           [3] m/s
 
+    Scenes with cloth, rods, springs, ties, fibres or a Poisson's ratio have further arrays, see docs/materials.md.
+
     The buffer `pin_hard` [P] or [B, P] says which pins hold exactly; change it to release and to grasp. `set_material`
     checks and replaces all of these. The rest shape is compiled and has no gradient.
 
@@ -47,7 +49,7 @@ class Simulator(Stepper):
     brings NaN, or negative stiffness, masses or springs, `Info.residual` is NaN (`Info` names the exceptions). So let
     an optimiser learn the logarithm of positive quantities.
 
-    Guides: docs/quickstart.md, docs/solvers.md (solver, iterations, tolerance), docs/gpu.md (kernel, batch).
+    Guides: docs/quickstart.md, docs/materials.md, docs/solvers.md (solver, iterations, tolerance), docs/gpu.md.
 
     Args:
         scene: bodies and effects.

@@ -11,7 +11,7 @@ import torch
 from .. import _C
 from ..common.checks import NO_VALUES
 from ..common.tables import MULTILEVEL_TABLE
-from ..estimate.convergence import FAR_TOO_FEW, forecast, is_bound
+from ..estimate.convergence import FAR_TOO_FEW, forecast, has_contacts, is_bound
 from ..plan.cpu_plan import quoted_choices
 from ..plan.kernel_choice import shared_bytes
 from ..plan.placement import step_bytes
@@ -66,7 +66,8 @@ def _expectation_lines(sim: Stepper) -> list[str]:
     if expected is not None:
         left = expected.error(sim.iterations)
         verdict = f"; {sim.iterations} leave about {left:.1g}: far too few" if left > FAR_TOO_FEW else ""
-        hardest = " when a stiff body lands" if is_bound(scene) else ""
+        hardest = " when a stiff body lands" if has_contacts(scene) else " in the worst case"
+        hardest = hardest if is_bound(scene) else ""
         counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
         lines.append(f"expected{hardest}: an error of {counts} iterations, estimated from the weights{verdict}")
         if sim.tolerance and expected.iterations(sim.tolerance) > sim.iterations:

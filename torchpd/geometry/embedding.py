@@ -12,18 +12,21 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from .closest_points import closest_points
 from .mesh_checks import warn
 from .mesh_faces import TET_FACES
 from .mesh_quality import shape_gradients
 from .tri_mesh import TriMesh
 
-__all__ = ["Embedding", "embed_surface", "embed_triangles"]
+__all__ = ["Embedding", "embed_in_sheet", "embed_surface", "embed_triangles"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 # number of nearest tets compared for a point outside of all
 _NEAREST = 32
+# edges between a surface vertex and the sheet that carries it
+_OFF_SHEET = 0.1
 # points processed at a time, to bound memory
 _CHUNK = 100_000
 
@@ -32,11 +35,12 @@ _CHUNK = 100_000
 class Embedding:
     """Embedding of a surface: surface vertex i is sum_a weights[i, a] x[corners[i, a]].
 
-    Weights add up to 1, so every affine motion of the mesh is reproduced exactly.
+    Weights add up to 1, so every affine motion of the mesh is reproduced exactly. The fourth one is 0 in a sheet of
+    triangles.
     """
 
     surface: TriMesh  # surface at rest; its triangles and texture coordinates stay valid for `apply`
-    tets: Index  # tet of each surface vertex [n]
+    tets: Index  # tet, or triangle of a sheet, of each surface vertex [n]
     weights: Array  # barycentric coordinates [n, 4], not negative inside the tet
     corners: Index  # rows `tets` of the mesh [n, 4]: the vertices of the weights
     vertex_count: int  # number of mesh vertices
@@ -186,6 +190,23 @@ def _report_far(corners: Array, distance: Array) -> None:
             f"{cells[worst]:.3g} cells ({distance[worst]:.3g} m): their motion is extrapolated. Move or scale the "
             "surface onto the mesh, surface.transformed(matrix), or use a mesh that encloses it"
         )
+
+
+def embed_in_sheet(surface: TriMesh, vertices: Array, triangles: Index) -> Embedding:
+    """Embed a surface in a sheet of vertices [V, 3] and triangles [T, 3], see `embed`; the fourth weight is 0."""
+    found = closest_points(surface.vertices, vertices, triangles)
+    corners = triangles[found.elements]
+    ends = vertices[corners]
+    edges = np.linalg.norm(ends - np.roll(ends, 1, axis=1), axis=2).max(axis=1)
+    far = np.flatnonzero(found.distances > _OFF_SHEET * edges)
+    if far.size:
+        worst = float(found.distances.max())
+        warn(
+            f"embed: {far.size} of {len(corners)} surface vertices lie off the sheet, up to {worst:.3g} m: they are "
+            "drawn on it. Move or scale the surface onto the sheet, surface.transformed(matrix)"
+        )
+    weights = np.pad(found.weights, ((0, 0), (0, 1)))
+    return Embedding(surface, found.elements, weights, np.pad(corners, ((0, 0), (0, 1)), mode="edge"), len(vertices))
 
 
 def embed_triangles(vertices: Array, tets: Index, triangles: Index) -> Embedding:

@@ -13,7 +13,7 @@ from ..common.synonyms import check_arguments
 from ..common.units import Unit
 from ..formats.bodies import read_body
 from ..formats.guard import name_file_in_errors
-from .embedding import Embedding, embed_surface, embed_triangles
+from .embedding import Embedding, embed_in_sheet, embed_surface, embed_triangles
 from .mesh_checks import (
     MeshWarning,
     Numbers,
@@ -237,14 +237,20 @@ def without_face_checks(
     return mesh
 
 
-def embed(surface: TriMesh, mesh: TetMesh) -> Embedding:
-    """Embed a surface in a tetrahedral mesh: each vertex in the tet that contains it, or else in the nearest one.
+def embed(surface: TriMesh, mesh: TetMesh | TriMesh) -> Embedding:
+    """Embed a surface in a tetrahedral mesh or a sheet, for a finer surface than the simulated one.
 
-    A vertex outside of the mesh is extrapolated, with negative weights. A strain of the tet
-    moves a distant vertex by more than the strain. A `MeshWarning` reports vertices farther outside than their tet is
-    long.
+    In a tetrahedral mesh each vertex lies in the tet that contains it, or else in the nearest one. A vertex outside of
+    the mesh is extrapolated, with negative weights. A strain of the tet moves a distant vertex by more than the strain.
+    A `MeshWarning` reports vertices farther outside than their tet is long.
+
+    On a sheet each vertex moves with the closest point of the triangles, and loses its distance to it. A `MeshWarning`
+    reports vertices that lie farther off than a tenth of an edge.
     """
-    for name, value, kind in (("surface", surface, TriMesh), ("mesh", mesh, TetMesh)):
-        if not isinstance(value, kind):
-            raise TypeError(f"embed: {name} must be a {kind.__name__}, got {type(value).__name__}")
+    if not isinstance(surface, TriMesh):
+        raise TypeError(f"embed: surface must be a TriMesh, got {type(surface).__name__}")
+    if isinstance(mesh, TriMesh):
+        return embed_in_sheet(surface, mesh.vertices, mesh.triangles)
+    if not isinstance(mesh, TetMesh):
+        raise TypeError(f"embed: mesh must be a TetMesh, or a TriMesh such as cloth.surface, got {type(mesh).__name__}")
     return embed_surface(surface, mesh.vertices, mesh.tets)

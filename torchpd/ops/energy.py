@@ -19,5 +19,6 @@ _CORE = len(MATERIAL_TABLE) - len(EFFECT_ROWS)  # arrays that every scene has
 def elastic_energy(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
     """Elastic energy of each environment [B] J, from the arrays of the ops."""
     arrays, constants = list(material), list(plan)
-    energy = cast(Tensor, _ops.element_energy(positions, arrays, constants)).sum(-1)
-    return energy + _ops.effect_energy(positions, arrays, constants) if len(arrays) > _CORE else energy
+    if len(arrays) > _CORE:
+        return cast(Tensor, _ops.effect_energy(positions, arrays, constants))  # of tetrahedra, too
+    return cast(Tensor, _ops.element_energy(positions, arrays, constants)).sum(-1)

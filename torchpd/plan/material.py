@@ -46,6 +46,8 @@ MATERIAL_ROWS = {row.name: row for row in (*MATERIAL_TABLE, *LOAD_ROWS)}
 CORE_ROWS = tuple(row.name for row in MATERIAL_TABLE if not row.effect)  # arrays that every scene has
 # hints for names of scene arguments given to `set_material`
 SCENE_NAME_HINTS = {
+    "activation": "it is an input of steps, targets={fibres: activation}; fibre_length is 1 - contraction activation",
+    "area_density": "masses holds the mass of each vertex [kg], area_density times its share of the area",
     "density": "masses holds the mass of each vertex [kg], density times its share of the volume",
     "youngs": "stiffness holds Young's modulus of each tetrahedron [Pa]",
 }
@@ -145,7 +147,7 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
     elif name in _NOT_NEGATIVE:
         _require(tensor >= 0, full, ">= 0", tensor)
     elif name == "membrane_poisson":
-        _require((tensor > -1) & (tensor <= 0.5), full, "in (-1, 0.5]", tensor)
+        _require((tensor > -1) & (tensor < 1), full, "in (-1, 1)", tensor)
     elif name == "poisson":
         _require((tensor > -1) & (tensor < 0.495), full, "in (-1, 0.495)", tensor)
     elif name == "damping":
@@ -163,8 +165,10 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
 
 def real_tensor(owner: str, name: str, value: Tensor | float) -> Tensor:
     """Convert to a dense tensor of real numbers, on the CPU if it is not a tensor yet."""
+    # torch would round a Python number to its default precision
+    wide = torch.float64 if isinstance(value, float) else None
     try:
-        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, device="cpu")
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(value, dtype=wide, device="cpu")
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{owner}: {name} must be a number or a tensor, got {value!r}") from None
     if tensor.is_complex() or tensor.dtype == torch.bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +9,6 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import Tensor
-
-from .stencils import StencilGroup
 
 __all__ = ["PIN_HARD", "PinnedComponents", "hold_exactly", "split_springs"]
 
@@ -43,16 +40,9 @@ class PinnedComponents:
     points: Array  # [P, 3] m
     component: Index  # [P] number of the component that each holds
     squares: Array  # [components] m^2, second moment by mass: mean square distance of vertices from their mean
-    joined: Mask  # [components] whether a spring or tie leads to another component
 
     @staticmethod
-    def of(
-        positions: Array,
-        masses: Array,
-        component: Index,
-        pin_vertices: Index,
-        stencils: Iterable[StencilGroup] = (),
-    ) -> PinnedComponents:
+    def of(positions: Array, masses: Array, component: Index, pin_vertices: Index) -> PinnedComponents:
         """Build it from arrays of `SceneValues`."""
 
         def means(values: Array) -> Array:
@@ -62,20 +52,15 @@ class PinnedComponents:
 
         arms = positions - means(positions)[component]
         squares = means((arms**2).sum(axis=1, keepdims=True))[:, 0]
-        joined = np.zeros(len(squares), dtype=np.bool_)
-        for group in stencils:
-            ends = component[group.corners]
-            joined[ends[(ends != ends[:, :1]).any(axis=1)]] = True
-        return PinnedComponents(positions[pin_vertices], component[pin_vertices], squares, joined)
+        return PinnedComponents(positions[pin_vertices], component[pin_vertices], squares)
 
     def loose(self, hard: Mask) -> Mask:
         """Whether each component can move rigidly in any environment [components]; `hard` is [P] or [B, P].
 
         Soft pins leave a component all rigid motions. Hard ones leave it rotations if they lie at a point or along a
-        line. Then at most one eigenvalue of their covariance is significant against the size of the component. A
-        component that a spring or tie joins to another one has none: the energy of the spring would change.
+        line. Then at most one eigenvalue of their covariance is significant against the size of the component.
         """
-        loose = ~self.joined
+        loose = np.ones(len(self.squares), dtype=np.bool_)
         if not len(self.points):
             return loose
         held, of = np.unique(self.component, return_inverse=True)
@@ -98,5 +83,5 @@ class PinnedComponents:
         means = sums[..., 1:] / np.maximum(sums[..., :1], 1.0)
         mean, square = means[..., :3], means[..., 3:].reshape(*means.shape[:2], 3, 3)
         spread = np.linalg.eigvalsh(square - mean[..., :, None] * mean[..., None, :])
-        loose[held] &= (spread[..., 1] <= _APART * self.squares[held]).any(axis=0)
+        loose[held] = (spread[..., 1] <= _APART * self.squares[held]).any(axis=0)
         return loose

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..common.synonyms import check_arguments
 from ..geometry.mesh_faces import mesh_components
+from .averaging import check_signs
 from .cloth import Cloth
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .fibres import Fibres
@@ -44,7 +46,7 @@ class SceneValues:
     planes: Array  # [C, 5] unit normal, height, friction
     spheres: Array  # [S, 5] center, radius, friction
     damping: float  # 1/s
-    component: Index  # [V] number of the connected component of each vertex
+    component: Index  # [V] number of the connected component of each vertex; springs and ties join those of bodies
     pinned: PinnedComponents  # pinned points of the components
     loose: NDArray[np.bool_]  # [components] whether hard pins leave a component rigid motions
     stencils: tuple[StencilGroup, ...] = ()  # at most one group per kind, in the order of `stencils.KINDS`
@@ -57,6 +59,19 @@ class SceneValues:
 def _no_part(part: object) -> TypeError:
     fix = "; pass them one by one, Scene(*parts)" if isinstance(part, (list, tuple)) else ""
     return TypeError(f"Scene: parts are bodies and effects of torchpd, got {type(part).__name__}{fix}")
+
+
+def _joined(component: Index, stencils: Iterable[StencilGroup]) -> Index:
+    """Components that springs and ties join count as one: only their common rigid motions change no elastic energy."""
+    ends = [np.stack(np.broadcast_arrays(of[:, :1], of[:, 1:]), axis=-1).reshape(-1, 2) for of in (
+        component[group.corners] for group in stencils
+    )]  # fmt: skip
+    pairs = np.concatenate([np.stack([component, component], axis=1), *ends])
+    if not (pairs[:, 0] != pairs[:, 1]).any():
+        return component
+    whole = mesh_components(pairs)[component]
+    _, first, number = np.unique(whole, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[number], dtype=np.int64)
 
 
 class Scene:
@@ -189,9 +204,10 @@ class Scene:
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
-        masses, component = np.concatenate([body.masses() for body in self.bodies]), self._components()
         stencils = merge_groups(group for part in self.parts for group in part.stencils(lambda body: starts[id(body)]))
-        pinned = PinnedComponents.of(positions, masses, component, pin_vertices, stencils)
+        masses = np.concatenate([body.masses() for body in self.bodies])
+        component = _joined(self._components(), stencils)
+        pinned = PinnedComponents.of(positions, masses, component, pin_vertices)
         gravity, damping = self._all(Gravity), self._all(Damping)
         none = np.zeros(0)
         poisson, tet_group = self._poisson()
@@ -219,7 +235,7 @@ class Scene:
         )
 
     def _components(self) -> Index:
-        """Number of the connected component of each vertex [V]; springs and ties join none."""
+        """Number of the connected component of each vertex within its body [V]."""
         parts, count = [], 0
         for body in self.bodies:
             parts.append(mesh_components(body.elements) + count)
@@ -230,12 +246,19 @@ class Scene:
         """Poisson's ratios of all tetrahedra and their groups, or None if every solid has the scalar 0."""
         if all(isinstance(solid.poisson, float) for solid in self.solids):
             return None, None
-        ratios, groups, count = [], [], 0
+        ratios = [np.broadcast_to(solid.poisson, len(solid.mesh.tets)) for solid in self.solids]
+        poisson, group = np.concatenate(ratios), self.averaging_groups
+        check_signs("Solid.poisson", poisson, group)
+        return poisson, group
+
+    @property
+    def averaging_groups(self) -> Index:
+        """Numbers of the groups of tetrahedra that share the mean of their volume strain [E]."""
+        groups, count = [np.zeros(0, dtype=np.int64)], 0
         for solid in self.solids:
-            ratios.append(np.broadcast_to(solid.poisson, len(solid.mesh.tets)))
             groups.append(solid.averaging_groups + count)
             count = int(groups[-1].max()) + 1
-        return np.concatenate(ratios), np.concatenate(groups)
+        return np.concatenate(groups)
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(type(part).__name__ for part in self.parts)})"

@@ -23,7 +23,7 @@ Index = NDArray[np.int64]
 class Springs(KeyPart):
     """Springs between pairs of vertices, of one body or of two: k / 2 (|x1 - x0| - L)^2.
 
-    Springs join no components: each of two bodies has rigid motions of its own.
+    Two bodies that springs join move together rigidly in a step; iterations do the rest.
 
     Args:
         body: the body of the first vertices.

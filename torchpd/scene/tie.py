@@ -29,7 +29,8 @@ class Tie(KeyPart):
     """Ties vertices of one body to points of another: k / 2 |x_v - sum b_a x_a|^2.
 
     A point is the closest one of the other body to `points`, in a tetrahedron, triangle or segment with barycentric
-    coordinates b. The tie pulls the vertex to the point itself, as a spring of length zero. Ties join no components.
+    coordinates b. The tie pulls the vertex to the point itself, as a spring of length zero. Two bodies that a tie joins
+    move together rigidly in a step; iterations do the rest.
 
     Args:
         body: the body of the vertices.

@@ -362,9 +362,9 @@ class Model(nn.Module):
         steps again. An `UnsolvedWarning` comes once if default iterations, or those of "auto", become too few.
 
         Args:
-            arrays: by name, see `Simulator`. One number is for all elements, vertices or pins of `stiffness`, `masses`
-                or `pin_stiffness`; [B, 1] is one number for each environment, also of `damping`. The last dimension
-                never counts environments.
+            arrays: by name, see `Simulator`. One number is for all elements, vertices or pins of an array without
+                columns; [B, 1] is one number for each environment, also of `damping`. The last dimension never counts
+                environments.
             friction, height, radius: columns of `planes` and `spheres`, in place of these. `friction` is [C + S] with
                 grounds first, `height` [C] m, `radius` [S] m. Each may be one number, or [B, 1].
 
@@ -468,6 +468,8 @@ class Model(nn.Module):
                 # the material may have been trained, so it keeps its digits
                 report_resolution(self.scene, wanted.dtype)
                 self.rest_positions = torch.tensor(self.scene.rest_positions, dtype=wanted.dtype, device=wanted.device)
+                if (contraction := self.anchors.contraction) is not None:
+                    self.fibre_contraction = torch.tensor(contraction, dtype=wanted.dtype, device=wanted.device)
         self._refresh_pin_mask()
         if chooses:
             with persistent_tensors():

@@ -207,7 +207,7 @@ class Readable(Model):
         """Average at every vertex of values of its tetrahedra, weighted by their rest volumes. Differentiable.
 
         For colours and contours of a field that jumps between tetrahedra, such as `stress(state).von_mises`. It is NaN
-        at vertices of inverted tetrahedra, whose stress is NaN.
+        at vertices of inverted tetrahedra, whose stress is NaN, and 0 at vertices without tetrahedra.
 
         Args:
             values: of tetrahedra [B, E, ...].

@@ -108,29 +108,34 @@ def _of_cloth(
     # so that no NaN reaches the derivatives of the others
     lost = collapsed[..., None]
     flat = torch.eye(3, dtype=a.dtype, device=a.device)
-    x, y, across = (torch.where(lost, axis, column) for axis, column in zip(flat, (a, b, normal), strict=True))
-    area = length(across)
-    n = across / area[..., None]
+    x, y, up = (torch.where(lost, axis, column) for axis, column in zip(flat, (a, b, normal), strict=True))
+    area = length(up)
+    n = up / area[..., None]
     first, second = x + torch.linalg.cross(y, n), y - torch.linalg.cross(x, n)
     size = length(first)[..., None]
     r, s = first / size, second / size
-    stretch = torch.stack([torch.stack([dot(r, x), dot(r, y)], -1), torch.stack([dot(s, x), dot(s, y)], -1)], -2)
     identity = torch.eye(2, dtype=a.dtype, device=a.device)
+    along, across = x - r, y - s
+    biot = _matrix(dot(r, along), dot(r, across), dot(s, along), dot(s, across))  # U - 1
     youngs, poisson, thickness = (
         material[name][..., own] for name in ("membrane_youngs", "membrane_poisson", "thickness")
     )
     shear = youngs * thickness / (1.0 + poisson)  # 2 mu
     volume = shear * poisson / (1.0 - poisson)  # lambda
-    trace = dot(r, x - r) + dot(s, y - s)
+    trace = biot[..., 0, 0] + biot[..., 1, 1]
     pressure = torch.minimum(volume * trace, shear.expand_as(trace))
-    nominal = shear[..., None, None] * (stretch - identity) + pressure[..., None, None] * identity
-    kirchhoff = product(nominal, stretch)
+    nominal = shear[..., None, None] * biot + pressure[..., None, None] * identity
+    kirchhoff = product(nominal, biot + identity)
     if "thread" in places:
         kirchhoff = kirchhoff + _of_threads(rest["thread"], positions, places["thread"], material, (r, s), lost)
     cauchy = kirchhoff / area[..., None, None]
     cauchy = torch.where(lost[..., None], torch.nan, 0.5 * (cauchy + cauchy.mT))  # symmetric except for rounding
-    strain = torch.stack([torch.stack([dot(a, a), dot(a, b)], -1), torch.stack([dot(a, b), dot(b, b)], -1)], -2)
-    return MembraneStress(cauchy, _principal(cauchy), 0.5 * (strain - identity), collapsed)
+    strain = 0.5 * (_matrix(dot(a, a), dot(a, b), dot(a, b), dot(b, b)) - identity)
+    return MembraneStress(cauchy, _principal(cauchy), strain, collapsed)
+
+
+def _matrix(xx: Tensor, xy: Tensor, yx: Tensor, yy: Tensor) -> Tensor:
+    return torch.stack([torch.stack([xx, xy], dim=-1), torch.stack([yx, yy], dim=-1)], dim=-2)
 
 
 def _of_threads(

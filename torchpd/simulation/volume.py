@@ -46,12 +46,11 @@ def volumes(scene: Scene, positions: Tensor) -> dict[Body, Tensor]:
     """Implementation of `Simulator.volume` for checked positions [B, V, 3]."""
     found: dict[Body, Tensor] = {}
     for body, elements in _elements(scene, positions.device).items():
-        # a point of the body, so that no digits are lost far from the origin
-        about = positions[:, scene.vertex_range(body).start, None] if isinstance(body, Cloth) else None
-        a, b, c, *rest = (positions[:, elements[:, corner]] for corner in range(elements.shape[1]))
-        if rest:
-            a, b, c = b - a, c - a, rest[0] - a
-        else:
-            a, b, c = a - about, b - about, c - about
-        found[body] = tree_sum(dot(a, torch.linalg.cross(b, c))[..., None])[..., 0] / 6.0
+        # about a point of the body, so that no digits are lost far from the origin: a tetrahedron's last corner, or the
+        # first vertex of a sheet
+        a, b, c, *last = (positions[:, elements[:, corner]] for corner in range(elements.shape[1]))
+        about = last[0] if last else positions[:, scene.vertex_range(body).start, None]
+        a, b, c = a - about, b - about, c - about
+        sign = -1.0 if last else 1.0
+        found[body] = tree_sum(dot(a, torch.linalg.cross(b, c))[..., None])[..., 0] * (sign / 6.0)
     return found
