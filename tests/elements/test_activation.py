@@ -62,7 +62,7 @@ def test_what_is_ambiguous_or_of_another_type_is_refused() -> None:
     with pytest.raises(TypeError, match=r"targets of Fibres must be torch.float64 .*, got torch.float32"):
         sim(sim.rest_state(), targets={upper: torch.tensor(0.5)})
     other = pickle.loads(pickle.dumps(sim))
-    with pytest.raises(ValueError, match="this Fibres is not a Pin, Sphere or Fibres of the scene"):
+    with pytest.raises(ValueError, match=r"this Fibres is not a Pin, .* of the scene"):
         other(other.rest_state(), targets={upper: torch.tensor(0.5).double()})
     assert other(other.rest_state(), targets={other.scene.fibres[0]: torch.tensor(0.5).double()}) is not None
 
