@@ -109,8 +109,8 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
         ({pin: [[0.0, 0.0, 0.0]] * 2}, TypeError, r"targets of a Pin .*, got list"),
         ({pin: None}, TypeError, r"targets of a Pin .*, got NoneType"),
         (np.zeros((3, 3)), TypeError, r"targets must be a tensor or a mapping from parts to tensors, got ndarray"),
-        ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, ValueError, r"this Sphere is not a Pin, Sphere or Fibres of the scene"),
-        ({sim.scene.solids[0]: torch.zeros(3)}, ValueError, r"this Solid is not a Pin or Sphere of the scene"),
+        ({pd.Sphere((0, 0, 0), 1.0): torch.zeros(3)}, ValueError, r"this Sphere is not a Pin, Sphere or Fibres"),
+        ({sim.scene.solids[0]: torch.zeros(3)}, ValueError, r"this Solid is not a Pin, Sphere or Fibres"),
     ]
     for target, kind, message in targets:
         with pytest.raises(kind, match=message):
