@@ -215,7 +215,7 @@ class Stepper {
       });
     const auto environment_of = [&](int lane) { return in_.environment(lane); };
     sweep_.set_weights(call_.material.stiffness, set_.weighted, environment_of);
-    sweep_.set_stencil_numbers(call_.material.effects, environment_of);
+    sweep_.set_stencil_numbers(call_.effects, environment_of);
     team_.barrier();
     const Elements<SolidDiagonal, StencilDiagonal> diagonal{{}, {set_.weighted}};
     sweep_.run(0, diagonal, [&](std::int64_t i, const Value& force, Sum& sums) {

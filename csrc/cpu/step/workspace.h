@@ -66,7 +66,8 @@ struct Workspace {
   bool some_go_on = false;  // some environment moves in the next leg
 
   explicit Workspace(const StepCall<T>& call)
-      : Workspace(call.plan, call.material, shares_elasticity(call.material),
+      : Workspace(call.plan, call.material,
+                  call.material.stiffness.stride == 0 && shares_effects(call.effects),
                   call.forces != nullptr) {}
 
   explicit Workspace(const FieldCall<T>& call) : Workspace(call.plan, {}, true, false) {}

@@ -5,9 +5,10 @@
 
 namespace pd {
 
-template <class T, bool WithLevels, bool Computed>
-class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
-  using Base = ConjugateTeam<T, WithLevels, Computed>;
+template <class Work, bool WithLevels, bool Computed>
+class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
+  using Base = ConjugateTeam<Work, WithLevels, Computed>;
+  using typename Base::T;
   using Base::call_;
   using Base::cycle_;
   using Base::direction_pending_;

@@ -11,19 +11,26 @@ namespace pd {
 
 template <class T>
 struct ConjugateBlock {
+  using real = T;
   DeviceConjugate<T> call;
   FieldWork<T> product;  // with the search direction
   T* image;              // [batch, vertices, 3], the product
   FrictionVectors<T> friction;
 };
 
+// Writes the elastic product of an environment's direction to the entries.
+template <class T>
+__device__ void multiply_elements(const ConjugateBlock<T>& work, const PatchFields<2, T>& fields) {
+  each_pair<2>(fields.patch, fields, rest_of<false>(fields.patch),
+               work.product.weights_of(fields.environment), fields.entries, SolidHessian{});
+}
+
 // All iterations of one environment, independent of the others and without host synchronisation. A
 // thread keeps its vertices in all loops, so it reads its own writes to global memory.
-// `WithFriction`: adds the solve with friction.
-template <class T, bool WithFriction>
-__global__ void __launch_bounds__(conjugate_threads<T>)
-    conjugate_block(const __grid_constant__ ConjugateBlock<T> work) {
-  extern __shared__ __align__(16) std::byte shared[];
+// `WithFriction`: adds the solve with friction. `Work`: ConjugateBlock, or one that adds to it.
+template <bool WithFriction, class Work>
+PD_DEVICE void solve_in_block(const Work& work, std::byte* shared) {
+  using T = typename Work::real;
   __shared__ WarpSums warp_sums;
   const DeviceConjugate<T>& call = work.call;
   const DevicePlan<T>& plan = call.plan;
@@ -81,8 +88,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
   int products = 0;
   while (products < call.iterations && numbers.active) {
     ++products;
-    each_pair<2>(fields.patch, fields, rest_of<false>(fields.patch),
-                 work.product.weights_of(environment), fields.entries, SolidHessian{});
+    multiply_elements(work, fields);
     __syncthreads();
     double curvature[1] = {0};
     each_slot([&](int s, int i, std::int64_t at) {
@@ -120,8 +126,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     if (largest[1] > 0 && continues_with_friction(numbers, call.tolerance)) {
       FrictionSolve friction(nullptr, numbers.scale);
       friction.begin(products, adjoint_iterations);
-      FrictionBlock<T>(work.product, call, work.friction, work.image, fields, unit, warp_sums)
-          .run(friction);
+      FrictionBlock<Work>(work, fields, unit, warp_sums).run(friction);
       if (threadIdx.x == 0) friction.write(call.friction + environment * friction_count);
     }
   }
@@ -135,6 +140,13 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
   if (threadIdx.x == 0) numbers.write(progress);
 }
 
+template <class T, bool WithFriction>
+__global__ void __launch_bounds__(conjugate_threads<T>)
+    conjugate_block(const __grid_constant__ ConjugateBlock<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  solve_in_block<WithFriction>(work, shared);
+}
+
 template <class T>
 ConjugateBlock<T> arrange_block(Arena& arena, const DeviceConjugate<T>& call) {
   ConjugateBlock<T> work{call, arrange(arena, conjugate_field(call), 0), nullptr, {}};
@@ -146,13 +158,11 @@ ConjugateBlock<T> arrange_block(Arena& arena, const DeviceConjugate<T>& call) {
   return work;
 }
 
-template <class T>
-void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
-  Arena arena(memory);
-  const ConjugateBlock<T> work = arrange_block(arena, call);
-  const DevicePlan<T>& plan = call.plan;
-  compute_field_weights<false>(work.product, stream);
-  const auto kernel = call.friction ? conjugate_block<T, true> : conjugate_block<T, false>;
+// `pairs`: of tetrahedra, or items that threads take like them
+template <class Work>
+void launch_block(void (*kernel)(Work), const Work& work, int pairs, cudaStream_t stream) {
+  using T = typename Work::real;
+  const DevicePlan<T>& plan = work.call.plan;
   const std::size_t bytes = pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
   // Half as many threads if two blocks then share a multiprocessor, unless the plan is for one
   // environment. The batch of this call has no influence, since the number of threads sets the
@@ -161,10 +171,19 @@ void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStrea
   const bool share = plan.environments != 1 && resident_blocks(function, conjugate_threads<T> / 2,
                                                                bytes) >= 2 * multiprocessors();
   const int most = share ? conjugate_threads<T> / 2 : conjugate_threads<T>;
-  const int threads = std::min(int(whole_warps(plan.most_pairs)), most);
+  const int threads = std::min(int(whole_warps(pairs)), most);
   if (resident_blocks(function, threads, bytes) == 0) refuse_shared_memory(bytes);
   kernel<<<blocks_of(work.call.batch), threads, bytes, stream>>>(work);
   check(cudaGetLastError());
+}
+
+template <class T>
+void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
+  Arena arena(memory);
+  const ConjugateBlock<T> work = arrange_block(arena, call);
+  compute_field_weights<false>(work.product, stream);
+  launch_block(call.friction ? conjugate_block<T, true> : conjugate_block<T, false>, work,
+               call.plan.most_pairs, stream);
 }
 
 }  // namespace pd
