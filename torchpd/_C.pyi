@@ -6,12 +6,19 @@ from typing import Any
 from numpy import float64, int32, int64
 from numpy.typing import NDArray
 
+Stencils = list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]]
+
 def build_plan(
-    positions: NDArray[float64], tets: NDArray[int64], patch_size: int, progress: Callable[[float], None]
+    positions: NDArray[float64],
+    tets: NDArray[int64],
+    stencils: Stencils,
+    patch_size: int,
+    progress: Callable[[float], None],
 ) -> dict[str, NDArray[Any]]: ...
 def build_device_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],
+    stencils: Stencils,
     patches: int,
     kernel: int,
     fixed: bool,
@@ -30,10 +37,13 @@ def build_multilevel(
     progress: Callable[[float], None],
 ) -> dict[str, NDArray[Any]]: ...
 def plan_table() -> list[tuple[str, str, int, str, str]]: ...
+def stencil_table() -> list[tuple[str, str, int, str, str]]: ...
+def kind_table() -> list[tuple[str, int, int, int, tuple[str, ...], str]]: ...
 def multilevel_table() -> list[tuple[str, str, int, str, str]]: ...
 def device_plan_table() -> list[tuple[str, str, int, str, str]]: ...
+def device_stencil_table() -> list[tuple[str, str, int, str, str]]: ...
 def device_sizes() -> list[str]: ...
-def material_table() -> list[tuple[str, int, str, str]]: ...
+def material_table() -> list[tuple[str, int, str, str, bool]]: ...
 def material_columns() -> list[tuple[str, str, int, int, str]]: ...
 def settings_table() -> list[tuple[str, str, float, str, str]]: ...
 def fused_shared_bytes(real: int, many: bool, slots: int, entries: int, planes: int, spheres: int) -> int: ...
@@ -48,11 +58,13 @@ def step_bytes(
     real: int,
     sizes: NDArray[int32],
     level_sizes: NDArray[int32],
+    stencil_sizes: NDArray[int32],
     schedule: int,
     batch: int,
     planes: int,
     spheres: int,
     own_stiffness: bool,
+    own_effects: bool,
 ) -> int: ...
 
 info_numbers: int

@@ -27,6 +27,7 @@ __all__ = [
     "kernel_of",
     "loose_pieces",
     "quoted_choices",
+    "stencil_arrays",
     "with_loose_components",
 ]
 
@@ -179,6 +180,15 @@ def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
     return replace(plan, arrays=arrays, loose=values.loose)
 
 
+def stencil_arrays(values: SceneValues) -> list[tuple[int, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]]:
+    """Groups of stencils as the plans take them: number of the kind, corners, vectors g_a, measures, constants."""
+    kinds = list(KINDS)
+    return [
+        (kinds.index(group.kind), group.corners, group.gradients, group.measure, group.constants)
+        for group in values.stencils
+    ]
+
+
 def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
     """Counts of a CPU plan, in the order of PlanSize in csrc/views/views.h."""
     slots = np.diff(arrays["patch_slot"])
@@ -211,10 +221,7 @@ def compile_plan(
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype!r}")
     tets = len(values.tets)
     elements = tets + sum(len(group) for group in values.stencils)
-    stencils = [
-        (list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants)
-        for group in values.stencils
-    ]
+    stencils = stencil_arrays(values)
     with compile_progress(elements, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_plan(
             values.rest_positions, values.tets, stencils, patch_size or _patch_size(elements), advance
