@@ -28,6 +28,7 @@ def build_device_plan(
 def build_multilevel(
     positions: NDArray[float64],
     tets: NDArray[int64],
+    stencils: list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]],
     vertex_order: NDArray[int32],
     stiffness: NDArray[float64],
     inertia: NDArray[float64],

@@ -15,12 +15,14 @@ from .geometry.tri_mesh import TriMesh
 from .scene.cloth import Cloth
 from .scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .scene.fibres import Fibres
+from .scene.loads import Pressure, Wind
 from .scene.rod import Rod
 from .scene.scene import Scene
 from .scene.solvers import Chebyshev, Jacobi, Multilevel
 from .scene.springs import Springs
 from .scene.tie import Tie
 from .simulation.state import Info, State, Track
+from .simulation.surface_loads import SurfaceLoads
 from .version import __version__
 
 if load_extension()[0] is not None:
@@ -71,6 +73,7 @@ __all__ = [
     "PatchTransport",
     "Pin",
     "Plan",
+    "Pressure",
     "QuadricTransport",
     "Quadrics",
     "Reactions",
@@ -84,12 +87,14 @@ __all__ = [
     "Springs",
     "State",
     "Stress",
+    "SurfaceLoads",
     "TetMesh",
     "Tie",
     "Track",
     "TriMesh",
     "TuningWarning",
     "UnsolvedWarning",
+    "Wind",
     "__version__",
     "compile_plan",
     "embed",

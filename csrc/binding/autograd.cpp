@@ -152,8 +152,7 @@ class StepFunction : public torch::autograd::Function<StepFunction> {
   }
 
   static variable_list backward(AutogradContext* context, const variable_list& grads) {
-    const SavedTensors kept(context->get_saved_variables(),
-                            context->saved_data["arrays"].toInt());
+    const SavedTensors kept(context->get_saved_variables(), context->saved_data["arrays"].toInt());
     const bool forces = kept.forces.has_value(), starts = context->saved_data["starts"].toBool();
     const std::size_t start_edge = forces ? 3 : 2;
     TORCH_CHECK(!starts || !context->needs_input_grad(start_edge),
@@ -192,8 +191,7 @@ class RolloutFunction : public torch::autograd::Function<RolloutFunction> {
     TORCH_CHECK(!context->saved_data["thins"].toBool(),
                 "torchpd: the rollout op is differentiable with every=1 only, where it records "
                 "every state");
-    const SavedTensors kept(context->get_saved_variables(),
-                            context->saved_data["arrays"].toInt());
+    const SavedTensors kept(context->get_saved_variables(), context->saved_data["arrays"].toInt());
     const bool forces = kept.forces.has_value();
     const c10::List<bool> wanted = Edges{context, forces ? 3u : 2u}.material(kept.material.size());
     const variable_list values = call_rollout_vjp(

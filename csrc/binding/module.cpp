@@ -72,9 +72,14 @@ struct KindShape {
 
 std::vector<KindShape> kind_shapes() {
   std::vector<KindShape> kinds;
-#define KIND(name, type, what)                                                        \
-  kinds.push_back({#name, pd::type::corners, pd::type::dims, pd::type::constants,    \
-                   pd::type::numbers, {}, what});
+#define KIND(name, type, what)          \
+  kinds.push_back({#name,               \
+                   pd::type::corners,   \
+                   pd::type::dims,      \
+                   pd::type::constants, \
+                   pd::type::numbers,   \
+                   {},                  \
+                   what});
 #define PARAMETER(name, array) kinds.back().rows.push_back(#array);
 #include "elements/kinds.def"
 #undef KIND
@@ -107,9 +112,23 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices) {
       throw py::index_error(std::string(shape.name) +
                             ": corners refer to vertices that positions does not have");
   }
-  return {kind,           shape.corners,   shape.dims,     shape.constants,
-          shape.numbers,  count,           corner.data(),  gradient.data(),
-          measure.data(), constant.data()};
+  return {kind,  shape.corners, shape.dims,      shape.constants, shape.numbers,
+          count, corner.data(), gradient.data(), measure.data(),  constant.data()};
+}
+
+// Checks the elements of a scene; the arrays stay the caller's.
+pd::MeshElements mesh_elements(const Doubles& positions, const Indices& tets,
+                               const std::vector<Stencils>& stencils) {
+  check_mesh(positions, tets, !stencils.empty());
+  pd::MeshElements elements{positions.data(), positions.shape(0), tets.data(), tets.shape(0)};
+  for (const Stencils& group : stencils)
+    elements.groups.push_back(stencil_group(group, positions.shape(0)));
+  constexpr std::int64_t most = std::int64_t(1) << 28;
+  if (elements.count() > most)
+    throw py::value_error("a scene may have up to 2^28 = " + std::to_string(most) +
+                          " elements, whose corners 32 bits count, got " +
+                          std::to_string(elements.count()) + "; take a coarser mesh");
+  return elements;
 }
 
 // Adds the number of stencils of each kind, after the counts of StencilSize.
@@ -130,25 +149,10 @@ std::vector<std::int32_t> stencil_sizes(const pd::MeshPlan& plan, const pd::Mesh
   return sizes;
 }
 
-// The elements of a scene, which point into the arrays.
-pd::MeshElements elements_of(const Doubles& positions, const Indices& tets,
-                             const std::vector<Stencils>& stencils) {
-  check_mesh(positions, tets, !stencils.empty());
-  pd::MeshElements elements{positions.data(), positions.shape(0), tets.data(), tets.shape(0)};
-  for (const Stencils& group : stencils)
-    elements.groups.push_back(stencil_group(group, positions.shape(0)));
-  constexpr std::int64_t most = std::int64_t(1) << 28;
-  if (elements.count() > most)
-    throw py::value_error("a scene may have up to 2^28 = " + std::to_string(most) +
-                          " elements, which 32 bits count with their corners, got " +
-                          std::to_string(elements.count()) + "; take a coarser mesh");
-  return elements;
-}
-
 py::dict build_plan(const Doubles& positions, const Indices& tets,
                     const std::vector<Stencils>& stencils, int patch_size,
                     const std::function<void(double)>& progress) {
-  const pd::MeshElements elements = elements_of(positions, tets, stencils);
+  const pd::MeshElements elements = mesh_elements(positions, tets, stencils);
   if (patch_size < 16 || patch_size > 4096)
     throw py::value_error("patch_size must lie in 16..4096");
   auto plan = pd::build_plan(elements, patch_size, progress);
@@ -204,7 +208,7 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets,
                            const std::vector<Stencils>& stencils, int patches, int kernel,
                            bool fixed, const Numbers& piece,
                            const std::function<void(double)>& progress) {
-  const pd::MeshElements elements = elements_of(positions, tets, stencils);
+  const pd::MeshElements elements = mesh_elements(positions, tets, stencils);
   if (patches < 1 || patches > elements.count()) {
     throw py::value_error("patches must lie in 1.." + std::to_string(elements.count()) +
                           ", the number of elements, got " + std::to_string(patches));
@@ -235,23 +239,23 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets,
   return arrays;
 }
 
-py::dict build_multilevel(const Doubles& positions, const Indices& tets, const Numbers& order,
+py::dict build_multilevel(const Doubles& positions, const Indices& tets,
+                          const std::vector<Stencils>& stencils, const Numbers& order,
                           const Doubles& stiffness, const Doubles& inertia,
                           std::int64_t most_direct, bool folded, int threads,
                           const std::function<void(double)>& progress) {
-  check_mesh(positions, tets);
+  const pd::MeshElements elements = mesh_elements(positions, tets, stencils);
   const py::ssize_t vertices = positions.shape(0);
   if (order.ndim() != 1 || order.shape(0) != vertices)
     throw py::value_error("vertex_order must be int32 [vertices], a permutation");
-  if (stiffness.ndim() != 1 || stiffness.shape(0) != tets.shape(0))
-    throw py::value_error("stiffness must be float64 [tets]");
+  if (stiffness.ndim() != 1 || stiffness.shape(0) != elements.count())
+    throw py::value_error("stiffness must be float64 [elements]");
   if (inertia.ndim() != 1 || inertia.shape(0) != vertices)
     throw py::value_error("inertia must be float64 [vertices]");
   if (threads < 1) throw py::value_error("threads must be at least 1");
-  auto tables =
-      pd::build_multilevel({positions.data(), vertices, tets.data(), tets.shape(0), order.data(),
-                            stiffness.data(), inertia.data(), most_direct, folded},
-                           threads, progress);
+  auto tables = pd::build_multilevel(
+      {elements, order.data(), stiffness.data(), inertia.data(), most_direct, folded}, threads,
+      progress);
   py::dict arrays;
 #define X(name, type, width, rows, meaning) arrays[#name] = as_array(tables.name, width);
 #include "views/multilevel.def"
@@ -433,8 +437,8 @@ PYBIND11_MODULE(_C, m) {
         py::arg("stencils"), py::arg("patches"), py::arg("kernel"), py::arg("fixed"),
         py::arg("piece"), py::arg("progress"));
   m.def("build_multilevel", &build_multilevel, py::arg("positions"), py::arg("tets"),
-        py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"), py::arg("most_direct"),
-        py::arg("folded"), py::arg("threads"), py::arg("progress"));
+        py::arg("stencils"), py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"),
+        py::arg("most_direct"), py::arg("folded"), py::arg("threads"), py::arg("progress"));
   m.def(
       "plan_table", [] { return table(plan_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");

@@ -32,7 +32,7 @@ struct Cpu {
   static void view_stencils(Call&, at::TensorList, const Place&) {}  // the plan has them
   template <class Call>
   static const int32* stencil_counts(const Call& call) {
-    return call.plan.stencil_blocks > 0 ? call.plan.stencil_sizes + stencil_size_count : nullptr;
+    return pd::stencil_counts(call.plan);
   }
 
   static void step(const StepCall<float>& call, const Tensor&) {
@@ -145,6 +145,7 @@ TORCH_LIBRARY(torchpd, m) {
       "effect_products(Tensor positions, Tensor? direction, Tensor[] material, Tensor[] plan) -> "
       "Tensor[]");
   with_plan("elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted) -> Tensor");
+  with_plan("stiffness_at_rest(Tensor[] material, Tensor[] plan) -> Tensor");
   with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
   with_plan(
       "step_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor positions, "

@@ -215,8 +215,7 @@ std::vector<Tensor> effect_products(const Tensor& positions, const OptionalTenso
   const Tensor along = direction ? *direction : Tensor();
   std::vector<Tensor> products;
   for (std::size_t i = material_arrays; i < material.size(); ++i) {
-    products.push_back(
-        at::zeros({positions.size(0), material[i].size(-1)}, positions.options()));
+    products.push_back(at::zeros({positions.size(0), material[i].size(-1)}, positions.options()));
   }
   const Tensor out = at::empty({0}, positions.options());
   const Field field = Field::effect_products;
@@ -251,13 +250,13 @@ Tensor element_energy_product(const Tensor& positions, const Tensor& direction,
 }
 
 template <class Backend, class T>
-Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighted) {
+Tensor material_field(Field field, at::TensorList material, at::TensorList plan, bool weighted) {
   typename Backend::template Field<T> call;
   const Tensor& stiffness = array_of(material, "stiffness");
   const Place place{stiffness.device(), "stiffness"};
   call.plan = Backend::template plan_view<T>(plan, place);
   Backend::view_stencils(call, plan, place);
-  call.field = Field::diagonal;
+  call.field = field;
   call.weighted = weighted;
   const Tensor w = stiffness_of(material, call.plan.tets);
   const std::optional<std::int64_t> own = environments_of(material);
@@ -265,13 +264,22 @@ Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighte
   call.batch = own.value_or(1);
   const EffectArrays<T> effects(Backend::stencil_counts(call), material, call.batch, place);
   call.effects = effects.view;
-  const Tensor out = batched ? at::empty({call.batch, call.plan.vertices}, w.options())
-                             : at::empty({call.plan.vertices}, w.options());
+  const int32* counts = Backend::stencil_counts(call);
+  if (field == Field::stiffness_at_rest && !counts) return w.clone();
+  const std::int64_t rows =
+      field == Field::diagonal ? call.plan.vertices : count_elements(call.plan.tets, counts);
+  const Tensor out =
+      batched ? at::empty({call.batch, rows}, w.options()) : at::empty({rows}, w.options());
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
   call.out = out.mutable_data_ptr<T>();
   if (call.batch > 0) Backend::field(call, out);
   return out;
+}
+
+template <class Backend, class T>
+Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighted) {
+  return material_field<Backend, T>(Field::diagonal, material, plan, weighted);
 }
 
 template <class Backend>
@@ -281,6 +289,19 @@ Tensor elastic_diagonal(at::TensorList material, at::TensorList plan, bool weigh
   return stiffness.scalar_type() == at::kFloat
              ? diagonal_typed<Backend, float>(material, plan, weighted)
              : diagonal_typed<Backend, double>(material, plan, weighted);
+}
+
+// Stiffness of every element at rest, as a preconditioner takes it, [elements] or [batch, elements]: Young's modulus of
+// tetrahedra [Pa], then that of stencils kind by kind.
+template <class Backend>
+Tensor stiffness_at_rest(at::TensorList material, at::TensorList plan) {
+  const Tensor& stiffness = array_of(material, "stiffness");
+  check_real(stiffness, "stiffness", "[tets] or [batch, tets] (Pa)");
+  if (material.size() == material_arrays) return stiffness.clone();
+  const Field field = Field::stiffness_at_rest;
+  return stiffness.scalar_type() == at::kFloat
+             ? material_field<Backend, float>(field, material, plan, false)
+             : material_field<Backend, double>(field, material, plan, false);
 }
 
 template <class Backend, class T>
@@ -356,6 +377,7 @@ void register_ops(torch::Library& m) {
   m.impl("effect_energy", &effect_energy<Backend>);
   m.impl("effect_products", &effect_products<Backend>);
   m.impl("elastic_diagonal", &elastic_diagonal<Backend>);
+  m.impl("stiffness_at_rest", &stiffness_at_rest<Backend>);
   m.impl("precondition", &precondition<Backend>);
   m.impl("conjugate_gradients_", &conjugate_gradients_inplace<Backend>);
   m.impl("nearest_rotation", &nearest_rotation<Backend>);

@@ -50,7 +50,7 @@ constexpr int level_arrays = 0
 
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
-  std::int64_t level_size, tet, vertex, fine_end, fine_entry, fine_prolongation,
+  std::int64_t level_size, element, vertex, fine_end, fine_entry, fine_prolongation,
       host_fine_prolongation, device_fine_prolongation, fine_node_end, middle_end, middle_entry,
       middle, middle_prolongation, host_middle_prolongation, device_middle_prolongation,
       middle_node_end, coarse_entry, device_coarse_entry;
@@ -103,7 +103,7 @@ void view_stencils(Plan<T>& plan, at::TensorList arrays, int first, const Place&
 
 // The preconditioner's arrays, which begin at `first`.
 template <class T>
-Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
+Levels<T> levels_view(at::TensorList arrays, int first, int vertices, std::int64_t elements,
                       const Place& place) {
   check_array(arrays[first], at::kInt, level_size_count, 1, {at::kCPU, "every plan's sizes"},
               "plan.level_sizes", "counts");
@@ -113,7 +113,7 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
   const std::int64_t coarse = levels.coarse_unknowns();
   LevelRows count{};
   count.level_size = level_size_count;
-  count.tet = tets;
+  count.element = elements;
   count.vertex = vertices;
   count.fine_end = vertices + 1;
   count.fine_entry = size[level_fine_entries];
@@ -141,6 +141,17 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, int tets,
 #include "views/multilevel.def"
 #undef X
   return levels;
+}
+
+// Tetrahedra and stencils of a plan. `counts`: stencils of each kind; null without any.
+inline std::int64_t count_elements(std::int64_t tets, const int32* counts) {
+  std::int64_t elements = tets;
+  for (int k = 0; counts && k < int(KindNumber::count); ++k) elements += counts[k];
+  return elements;
+}
+template <class T>
+const int32* stencil_counts(const Plan<T>& plan) {
+  return plan.stencil_blocks > 0 ? plan.stencil_sizes + stencil_size_count : nullptr;
 }
 
 // Lengths of the arrays are checked; their contents are trusted.
@@ -188,7 +199,9 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
 #include "views/cpu_plan.def"
 #undef X
   if (stencils) view_stencils(plan, arrays, plan_arrays, place);
-  if (levels) plan.levels = levels_view<T>(arrays, levels_at, plan.vertices, plan.tets, place);
+  if (levels)
+    plan.levels = levels_view<T>(arrays, levels_at, plan.vertices,
+                                 int(count_elements(plan.tets, stencil_counts(plan))), place);
   return plan;
 }
 
@@ -362,10 +375,9 @@ constexpr int all_material_arrays = 0
 #undef X
 
 inline void check_material_size(at::TensorList material) {
-  TORCH_CHECK_VALUE(
-      material.size() == material_arrays || material.size() == all_material_arrays,
-      "material must be ", material_arrays, " arrays, or ", all_material_arrays,
-      " with those that only some scenes have, got ", material.size());
+  TORCH_CHECK_VALUE(material.size() == material_arrays || material.size() == all_material_arrays,
+                    "material must be ", material_arrays, " arrays, or ", all_material_arrays,
+                    " with those that only some scenes have, got ", material.size());
 }
 
 // The place of an array in a material.
@@ -427,8 +439,7 @@ inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
 inline void check_effects(const int32* counts, at::TensorList material) {
   if (!counts) return;
   TORCH_CHECK_VALUE(material.size() == all_material_arrays, "material must be ",
-                    all_material_arrays, " arrays for a plan with stencils, got ",
-                    material.size());
+                    all_material_arrays, " arrays for a plan with stencils, got ", material.size());
 #define KIND(kind, type, what)
 #define PARAMETER(kind, array) \
   check_effect(material, #array, #kind, counts[int(KindNumber::kind)]);
@@ -445,10 +456,9 @@ Effects<T> effects_view(const int32* counts, at::TensorList arrays, std::int64_t
   if (arrays.size() == material_arrays) return effects;
   int at = material_arrays;
 #define X(name, width, rows, meaning)
-#define EFFECT(name, width, rows, meaning)                                                     \
-  if (const std::int64_t count = rows_of(arrays[at], width, #name); count > 0)                 \
-    effects.name =                                                                             \
-        values_view<T>(arrays[at], count, width, false, batch, place, #name, meaning);         \
+#define EFFECT(name, width, rows, meaning)                                                        \
+  if (const std::int64_t count = rows_of(arrays[at], width, #name); count > 0)                    \
+    effects.name = values_view<T>(arrays[at], count, width, false, batch, place, #name, meaning); \
   ++at;
 #include "views/material.def"
 #undef X
@@ -479,9 +489,9 @@ inline std::optional<std::int64_t> environments_of(at::TensorList material) {
   if (array_of(material, "stiffness").dim() == 2) raise(material[0].size(0));
   std::size_t at = material_arrays;
 #define X(name, width, rows, meaning)
-#define EFFECT(name, width, rows, meaning)                                                     \
-  if (at < material.size() && material[at].dim() == (width > 1 ? 3 : 2))                       \
-    raise(material[at].size(0));                                                               \
+#define EFFECT(name, width, rows, meaning)                               \
+  if (at < material.size() && material[at].dim() == (width > 1 ? 3 : 2)) \
+    raise(material[at].size(0));                                         \
   ++at;
 #include "views/material.def"
 #undef X

@@ -12,8 +12,7 @@ void report_typed(const StepTensors& t, const Numbers& n) {
   call.plan = Backend::template plan_view<T>(t.plan, place);
   call.batch = t.positions.size(0);
   if (call.batch == 0) return;
-  call.material =
-      material_view<T>(call.plan, t.material, call.batch, place);
+  call.material = material_view<T>(call.plan, t.material, call.batch, place);
   call.time_step = n.time_step;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
   const Tensor f = t.forces ? t.forces->contiguous() : Tensor();

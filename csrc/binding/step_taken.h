@@ -27,8 +27,7 @@ class SolvedStep {
     call.plan = Backend::template plan_view<T>(t.plan, place);
     call.batch = t.after.size(0);
     check_vertices(t.after, call.plan.vertices);
-    call.material =
-        material_view<T>(call.plan, t.material, call.batch, place);
+    call.material = material_view<T>(call.plan, t.material, call.batch, place);
     const Material<T>& m = call.material;
     const Tensor elastic = diagonal_typed<Backend, T>(t.material, t.plan, true);
     const bool own = elastic.dim() == 2 && elastic.size(0) == call.batch;

@@ -77,7 +77,7 @@ struct MaterialRows {
   PD_HD MaterialRows(const Effects<T>& effects, std::int64_t environment) {
     int at = 0;
 #define KIND(name, type, what)
-#define PARAMETER(kind, array)                                    \
+#define PARAMETER(kind, array)                                  \
   if constexpr (std::is_same_v<Kind, TypeOf<KindNumber::kind>>) \
     row[at++] = effects.array.of(environment);
 #include "elements/kinds.def"

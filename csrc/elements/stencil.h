@@ -128,8 +128,7 @@ struct StencilNumbers {
   PD_HD explicit StencilNumbers(const Stencils& stencils) {
     for (int i = 0; i < gradient_numbers<Kind>; ++i) g[i] = stencils.stored(i);
     for (int i = 0; i < constant_slots<Kind>; ++i)
-      c[i] = i < Kind::constants ? stencils.stored(gradient_numbers<Kind> + i)
-                                 : R(scalar_of<R>(0));
+      c[i] = i < Kind::constants ? stencils.stored(gradient_numbers<Kind> + i) : R(scalar_of<R>(0));
     for (int i = 0; i < Kind::numbers; ++i) p[i] = stencils.number(i);
   }
 };
@@ -187,8 +186,8 @@ struct StencilDiagonal {
     using R = typename Stencils::R;
     const StencilNumbers<Kind, Stencils> s(stencils);
     const R none(scalar_of<R>(0)), one(scalar_of<R>(1)), corners{scalar_of<R>(Kind::corners)};
-    const R weight = bounded ? Kind::weight(s.p, stencils.bound(), corners)
-                             : Kind::weight(s.p, one, one);
+    const R weight =
+        bounded ? Kind::weight(s.p, stencils.bound(), corners) : Kind::weight(s.p, one, one);
     R square[Kind::corners];
     gradient_squares<Kind>(s.g, square);
     Vec3<R> d[Kind::corners];

@@ -54,7 +54,8 @@ struct Triangle {
     const auto longer = b2 <= a2;
     const Vec3<R> instead = some_normal(
         Vec3<R>{select(longer, a.x, b.x), select(longer, a.y, b.y), select(longer, a.z, b.z)});
-    const Vec3<R> n = {select(good, per_area * c.x, instead.x), select(good, per_area * c.y, instead.y),
+    const Vec3<R> n = {select(good, per_area * c.x, instead.x),
+                       select(good, per_area * c.y, instead.y),
                        select(good, per_area * c.z, instead.z)};
     const Vec3<R> r0 = a + cross(b, n), r1 = b - cross(a, n);
     const R h2 = dot(r0, r0);  // |r0| = |r1| = h

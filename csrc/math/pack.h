@@ -131,6 +131,16 @@ PD_HD Pack<T, W> multiply_add(Pack<T, W> a, Pack<T, W> b, Pack<T, W> c) {
     return V(_mm256_fmadd_pd((__m256d)a.v, (__m256d)b.v, (__m256d)c.v));
   if constexpr (sizeof(V) == 16 && sizeof(T) == 4)
     return V(_mm_fmadd_ps((__m128)a.v, (__m128)b.v, (__m128)c.v));
+  if constexpr (sizeof(V) > PD_VECTOR_BYTES) {  // by halves, which fuse as a scalar does
+    Pack<T, W / 2> x[2], y[2], z[2];
+    Pack<T, W> r;
+    std::memcpy(x, &a.v, sizeof(V));
+    std::memcpy(y, &b.v, sizeof(V));
+    std::memcpy(z, &c.v, sizeof(V));
+    for (int half = 0; half < 2; ++half) x[half] = multiply_add(x[half], y[half], z[half]);
+    std::memcpy(&r.v, x, sizeof(V));
+    return r;
+  }
 #endif
   return a * b + c;
 }

@@ -88,7 +88,8 @@ struct Plan {
   int vertices = 0, tets = 0, pins = 0, components = 0, blocks = 0, patches = 0, slots = 0,
       shared = 0;
   int most_slots = 0;  // of any patch
-  int stencil_blocks = 0, stencil_numbers = 0;  // blocks of 16 stencils; rows of 16 numbers of a step
+  int stencil_blocks = 0,
+      stencil_numbers = 0;  // blocks of 16 stencils; rows of 16 numbers of a step
   Levels<T> levels;
 };
 
@@ -279,9 +280,10 @@ enum class Field : int {
   element_energy,
   element_energy_product,
   diagonal,
-  report,  // see SolidReport
-  effect_energy,  // energy of all stencils
-  effect_products  // derivatives by the arrays of the effects
+  report,            // see SolidReport
+  effect_energy,     // energy of all stencils
+  effect_products,   // derivatives by the arrays of the effects
+  stiffness_at_rest  // of every element, as preconditioners take it
 };
 
 template <class T, class P = Plan<T>>
@@ -298,6 +300,7 @@ struct FieldCall : P::EffectViews {
   const T* direction = nullptr;  // [batch, vertices, 3], for the products
   T* out =
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
+  // stiffness_at_rest: [batch, elements], tetrahedra and then stencils kind by kind
 };
 
 // Sums over the vertices of an environment for a report, see solver/report.h.

@@ -57,9 +57,9 @@ def test_other_unknown_arguments_get_the_list() -> None:
         pd.Solid(MESH, yongs=1e5)
     with pytest.raises(TypeError, match=r"^Scene has no argument 'wind'; "):
         pd.Scene(pd.Solid(MESH, youngs=1e5), wind=1.0)
-    with pytest.raises(AttributeError, match=r"^torchpd has no attribute 'Wind'$") as caught:
-        pd.Wind  # noqa: B018
-    assert (caught.value.name, hasattr(pd, "Wind")) == ("Wind", False)
+    with pytest.raises(AttributeError, match=r"^torchpd has no attribute 'Rain'$") as caught:
+        pd.Rain  # noqa: B018
+    assert (caught.value.name, hasattr(pd, "Rain")) == ("Rain", False)
 
 
 def test_errors_of_python_name_the_class_of_users() -> None:

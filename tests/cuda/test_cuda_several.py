@@ -18,8 +18,7 @@ from torch import Tensor
 import torchpd as pd
 from torchpd import _C
 from torchpd.common.gpu import H100, properties_of
-from torchpd.ops.diagonal import step_diagonal
-from torchpd.plan.material import MATERIAL_ROWS
+from torchpd.ops.diagonal import named_material, step_diagonal
 
 require_gpu()
 

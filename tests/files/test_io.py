@@ -13,9 +13,10 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from sheets import sheet
 
 import torchpd as pd
-from torchpd.files.simulation_file import FORMAT_VERSION
+from torchpd.files.simulation_file import FORMAT_VERSION, load_simulation, save_simulation
 from torchpd.scene.solvers import Solver
 
 
@@ -98,7 +99,7 @@ def test_scene_comes_back(tmp_path: Path) -> None:
     sim.save(tmp_path / "sim")
     loaded = pd.Simulator.load(tmp_path / "sim").scene
     assert [type(part) for part in loaded.parts] == [type(part) for part in sim.scene.parts]
-    assert loaded.parts[0].solid is loaded.parts[2]
+    assert loaded.parts[0].body is loaded.parts[2]
     for one, two in zip(sim.scene.parts, loaded.parts, strict=True):
         for field in dataclasses.fields(one):
             value = getattr(one, field.name)
@@ -106,6 +107,42 @@ def test_scene_comes_back(tmp_path: Path) -> None:
                 np.testing.assert_array_equal(getattr(two, field.name), value)
     first, second = loaded.solids
     assert first.mesh is second.mesh
+
+
+def test_bodies_of_every_kind_come_back(tmp_path: Path) -> None:
+    """With the same stencils to the bit; parts may come before their bodies, and hold the loaded ones."""
+    rng = np.random.default_rng(1)
+    mesh = pd.shapes.box((0.4, 0.2, 0.2), (2, 1, 1))
+    soft = pd.Solid(mesh, 1e5, poisson=0.3, averaging=rng.integers(0, 3, 12))
+    pattern = sheet(cells=(2, 2))
+    uvs = pattern[0][:, [0, 2]][pattern[1]] * 0.9
+    shirt = pd.Cloth(
+        pd.TriMesh(*pattern), rng.uniform(1e4, 1e5, 8), 1e-3, 0.2, rest_uv=uvs, warp=30.0, grain=(1.0, 2.0)
+    )
+    shell = pd.Cloth(pd.TriMesh(*pattern), 1e5, 1e-3, 0.2, bending=1e-4, rest_curvature="surface")
+    rod = pd.Rod(rng.normal(size=(4, 3)), 1e6, 0.01, bending=0.0)
+    written = pd.Scene(
+        pd.Tie(rod, [0], soft, [[0.1, 0.1, 0.1]], stiffness=1e3), pd.Springs(rod, [[1, 0]], 50.0, other=shirt),
+        pd.Pin(shell, [0, 1]), shirt, soft, rod, shell, pd.Fibres(soft, rng.normal(size=3), 1e4, tension_only=True),
+        pd.Solid(mesh, 1e4),
+    )  # fmt: skip
+    pd.Simulator(everything()).save(tmp_path / "sim")
+    save_simulation(dataclasses.replace(load_simulation(tmp_path / "sim"), scene=written), tmp_path / "sim")
+    loaded = load_simulation(tmp_path / "sim").scene
+    assert [type(part) for part in loaded.parts] == [type(part) for part in written.parts]
+    assert (loaded.parts[0].body, loaded.parts[0].other, loaded.parts[7].solid) == (
+        loaded.parts[5], loaded.parts[4], loaded.parts[4],
+    )  # fmt: skip
+    assert (loaded.parts[4].poisson == 0.3).all()
+    assert (loaded.parts[8].poisson, loaded.parts[8].averaging) == (0.0, None)
+    one, two = written.values(), loaded.values()
+    np.testing.assert_array_equal(one.masses, two.masses)
+    np.testing.assert_array_equal(one.tet_group, two.tet_group)
+    for first, second in zip(one.stencils, two.stencils, strict=True):
+        for name in ("corners", "gradients", "measure", "constants"):
+            np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+        for name, row in first.material.items():
+            np.testing.assert_array_equal(row, second.material[name])
 
 
 def test_regions_come_back(tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ def build_levels(sim: pd.Simulator, *, folded: bool) -> dict[str, Any]:
     stiffness, inertia = (array.cpu().double().numpy() for array in stored_reference(sim.plan.arrays))
     values, order = sim.scene.values(), sim.plan.vertex_order.cpu().numpy()
     return _C.build_multilevel(
-        values.rest_positions, values.tets, order, stiffness, inertia,
+        values.rest_positions, values.tets, [], order, stiffness, inertia,
         0, folded, torch.get_num_threads(), lambda _: None,
     )  # fmt: skip
 

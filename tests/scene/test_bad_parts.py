@@ -9,9 +9,13 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from sheets import cloth, surface
 from small_scene import body
 
 import torchpd as pd
+from torchpd.common.warn import SceneWarning
+from torchpd.simulation.notices import warn_of_scene
+from torchpd.simulation.state_checks import report_resolution
 
 
 def test_effects_are_checked() -> None:
@@ -144,3 +148,106 @@ def test_positions_that_float32_cannot_resolve_are_said() -> None:
     # of two bodies the one that is far away; a large one near the origin has edges as large
     with pytest.warns(UserWarning, match=r"\(48 of 96 tets"):
         pd.Simulator(pd.Scene(*scene(0.0).parts, *scene(1e6).parts))
+
+
+def test_springs_ties_and_fibres_are_checked() -> None:
+    solid, other = body(), pd.Solid(body().mesh.translated((0.2, 0.0, 0.0)), 1e5)
+    for make, kind, message in (
+        (lambda: pd.Springs("solid", [[0, 1]], 1.0), TypeError, r"Springs\.body .*got str"),
+        (lambda: pd.Springs(solid, [[0, 1]], 1.0, other=3), TypeError, r"Springs\.other .*got int"),
+        (lambda: pd.Springs(solid, [], 1.0), ValueError, r"Springs\.pairs .*got none"),
+        (lambda: pd.Springs(solid, [0, 1], 1.0), ValueError, r"Springs\.pairs must be \[n, 2\] .*got \[2\]"),
+        (lambda: pd.Springs(solid, [[0.0, 1.0]], 1.0), TypeError, r"Springs\.pairs .*got float64"),
+        (lambda: pd.Springs(solid, [[0, 1], [0, 27]], 1.0), IndexError, r"0\.\.26 .*other\), got 27 at \[1, 1\]"),
+        (lambda: pd.Springs(solid, [[-1, 1]], 1.0, other=other), IndexError, r"of body\), got -1 at \[0, 0\]"),
+        (lambda: pd.Springs(solid, [[0, 1], [2, 2]], 1.0), ValueError, r"Springs\.pairs .*got \[2, 2\] at 1"),
+        (lambda: pd.Springs(solid, [[0, 1]], 0.0), ValueError, r"Springs\.stiffness .*got 0\.0"),
+        (lambda: pd.Springs(solid, [[0, 1]], [1.0, 2.0]), ValueError, r"Springs\.stiffness .*got \[2\]"),
+        (lambda: pd.Springs(solid, [[0, 1]], 1.0, -0.1), ValueError, r"Springs\.rest_length .*got -0\.1"),
+        (lambda: pd.Tie("solid", [0], solid, stiffness=1.0), TypeError, r"Tie\.body .*got str"),
+        (lambda: pd.Tie(solid, [0], "solid", stiffness=1.0), TypeError, r"Tie\.other .*got str"),
+        (lambda: pd.Tie(solid, [27], other, stiffness=1.0), IndexError, r"Tie\.vertices .*got 27"),
+        (lambda: pd.Tie(solid, [], other, stiffness=1.0), ValueError, r"Tie\.vertices .*got none"),
+        (lambda: pd.Tie(solid, [18], other, stiffness=0.0), ValueError, r"Tie\.stiffness .*got 0\.0"),
+        (lambda: pd.Tie(solid, [18], other, [0, 0, 0], stiffness=1.0), ValueError, r"Tie\.points .*got \[3\]"),
+        (lambda: pd.Tie(solid, [18], other, [[0, 0, math.nan]], stiffness=1.0), ValueError, r"Tie\.points .*got nan"),
+        (lambda: pd.Tie(solid, [5], solid, stiffness=1.0), ValueError, r"tied to itself, got vertex 5 .*\(1 in all\)"),
+        (lambda: pd.Fibres("solid", (1, 0, 0), 1.0), TypeError, r"Fibres\.solid .*got str"),
+        (lambda: pd.Fibres(solid, (1, 0), 1.0), ValueError, r"Fibres\.direction .*got \[2\]"),
+        (lambda: pd.Fibres(solid, (0, 0, 0), 1.0), ValueError, r"Fibres\.direction .*zero, got \[0\.0, 0\.0, 0\.0\]"),
+        (lambda: pd.Fibres(solid, (1, 0, math.inf), 1.0), ValueError, r"Fibres\.direction .*got inf"),
+        (lambda: pd.Fibres(solid, (1, 0, 0), -1.0), ValueError, r"Fibres\.stiffness .*got -1\.0"),
+        (lambda: pd.Fibres(solid, (1, 0, 0), 1.0, 1.1), ValueError, r"Fibres\.contraction .*got 1\.1"),
+        (lambda: pd.Fibres(solid, (1, 0, 0), 1.0, activation=-0.1), ValueError, r"Fibres\.activation .*got -0\.1"),
+        (lambda: pd.Fibres(solid, (1, 0, 0), 1.0, activation=[0.5]), ValueError, r"Fibres\.activation .*got \[1\]"),
+        (lambda: pd.Fibres(solid, (1, 0, 0), 1.0, tension_only="no"), TypeError, r"Fibres\.tension_only .*got 'no'"),
+        (lambda: pd.Fibres(solid, (1, 0, 0), 1.0, tets=[48]), IndexError, r"Fibres\.tets .*\(tetrahedra .*got 48"),
+        (lambda: pd.Fibres(solid, (1, 0, 0), 1.0, tets=np.zeros(48, bool)), ValueError, r"Fibres\.tets .*got none"),
+    ):
+        with pytest.raises(kind, match=message):
+            make()  # type: ignore[no-untyped-call]
+
+
+def test_rods_are_checked() -> None:
+    line = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 4)
+    for changed, kind, message in (
+        ({"polyline": line[:1]}, ValueError, r"Rod\.polyline .*at least two vertices, got 1"),
+        ({"polyline": line[:, :2]}, ValueError, r"Rod\.polyline must be \[n, 3\] .*got \[4, 2\]"),
+        ({"polyline": line * math.nan}, ValueError, r"Rod\.polyline must be finite, got nan"),
+        ({"polyline": line[[0, 1, 1, 2]]}, ValueError, r"Rod\.polyline: neighbours .*got \[0\.3.*\] at 1 and 2"),
+        ({"youngs": 0.0}, ValueError, r"Rod\.youngs .*got 0\.0"),
+        ({"radius": [0.1, 0.1]}, ValueError, r"Rod\.radius must be \[3\] .*got \[2\]"),
+        ({"density": -1.0}, ValueError, r"Rod\.density .*got -1\.0"),
+        ({"bending": -1.0}, ValueError, r"Rod\.bending .*got -1\.0"),
+        ({"bending": [1.0]}, ValueError, r"Rod\.bending must be \[2\] .*inner vertex .*got \[1\]"),
+        ({"rest_curvature": "straight"}, ValueError, r"Rod\.rest_curvature .*got 'straight'"),
+    ):
+        with pytest.raises(kind, match=message):
+            pd.Rod(**{"polyline": line, "youngs": 1e6, "radius": 0.01, **changed})
+    with pytest.warns(pd.MeshWarning, match=r"Rod: the polyline is 300 m long, .*pass polyline \* 0\.001 if"):
+        pd.Rod(300.0 * line, 1e6, 0.01)
+
+
+def test_parts_of_other_bodies_are_refused() -> None:
+    solid, other = body(), body()
+    for part in (
+        pd.Springs(solid, [[0, 1]], 1.0, other=other),
+        pd.Tie(other, [0], solid, stiffness=1.0),
+        pd.Fibres(other, (1, 0, 0), 1.0),
+    ):
+        kind = type(part).__name__
+        with pytest.raises(ValueError, match=f"Scene: the body of a {kind} must be a part of this scene, got another"):
+            pd.Scene(solid, part)
+
+
+def test_the_former_name_of_the_body_of_a_pin() -> None:
+    solid = body()
+    with pytest.warns(DeprecationWarning, match="Pin: solid is now called body"):
+        pin = pd.Pin(solid=solid, vertices=[0])
+    with pytest.warns(DeprecationWarning, match=r"Pin\.solid is now called body"):
+        assert pin.solid is solid
+    assert pin.body is solid
+    with pytest.raises(TypeError, match="Pin has no argument 'solid'"):
+        pd.Pin(vertices=[0], body=solid, solid=solid)
+
+
+def test_thin_bodies_and_small_spheres_are_said() -> None:
+    """Edges of a sheet of 4 x 4 cells are 0.25 m along the sides and 0.354 m across."""
+    sheet = cloth()
+    with pytest.warns(SceneWarning, match=r"sphere of radius 0\.3 m may meet edges .* of up to 0\.354 m") as said:
+        warn_of_scene(pd.Scene(sheet, pd.Sphere((0, -1, 0), 1.0), pd.Sphere((0, -1, 0), 0.3)))
+    assert said[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_scene(pd.Scene(sheet, pd.Sphere((0, -1, 0), 0.36)))
+        warn_of_scene(pd.Scene(body(), pd.Sphere((0, -1, 0), 0.01)))
+
+
+def test_sheets_that_float32_cannot_resolve_are_said() -> None:
+    far = pd.Scene(body(), cloth(surface().translated((0.0, 1e5, 0.0))))  # spacing of 1/128, edges of 1/4
+    with pytest.warns(UserWarning, match=r"0\.031 of the shortest edge of an element there \(32 of 80 elements"):
+        report_resolution(far, torch.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        report_resolution(far, torch.float64)
+        report_resolution(pd.Scene(cloth()), torch.float32)

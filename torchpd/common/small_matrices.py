@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-__all__ = ["dot", "inverse", "length", "product", "root"]
+__all__ = ["dot", "inverse", "length", "product", "root", "tree_sum"]
 
 
 def product(A: Tensor, B: Tensor) -> Tensor:
@@ -41,3 +41,14 @@ def root(squared: Tensor) -> Tensor:
 def length(a: Tensor) -> Tensor:
     """Length of vectors [..., 3], with derivative zero at zero."""
     return root(dot(a, a))
+
+
+def tree_sum(values: Tensor) -> Tensor:
+    """Sum over vertices of [..., n, k] by a binary tree: the same order for any leading dimensions."""
+    if values.shape[-2] == 0:
+        return values.sum(-2)
+    while (count := values.shape[-2]) > 1:
+        half = count // 2
+        pairs = values[..., :half, :] + values[..., half : 2 * half, :]
+        values = torch.cat([pairs, values[..., 2 * half :, :]], dim=-2) if count % 2 else pairs
+    return values[..., 0, :]

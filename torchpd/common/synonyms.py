@@ -54,6 +54,26 @@ SYNONYMS: dict[str, dict[str, str]] = {
         "position positions target targets": "a step takes targets: sim(state, targets={pin: positions})",
         "cloth mesh rod": "the body is `body`",
     },
+    "Cloth": {
+        "E modulus young young_modulus youngs_modulus": "Young's modulus is `youngs` [Pa]",
+        "nu poisson_ratio poissons_ratio": "Poisson's ratio is `poisson`",
+        "density mass rho": "mass is per area: `area_density` [kg/m^2], the density times the thickness",
+        "bend bend_stiffness bending_stiffness kb": "the flexural rigidity is `bending` [N m]",
+        "mesh triangles vertices": "the sheet is `surface`, a TriMesh(vertices, triangles)",
+        "uv uvs": "the rest shape by UVs is `rest_uv` [F, 3, 2] m",
+    },
+    "Rod": {
+        "E modulus young young_modulus youngs_modulus": "Young's modulus is `youngs` [Pa]",
+        "points vertices": "the vertices in order are `polyline` [N, 3]",
+        "r thickness": "`radius` is in m",
+    },
+    "Springs": {"k ke": "`stiffness` is in N/m", "L L0 length": "the `rest_length` is in m"},
+    "Tie": {"k ke": "`stiffness` is in N/m", "target targets": "`points` [N, 3] lie on the other body at rest"},
+    "Fibres": {
+        "body mesh": "the body is `solid`",
+        "w": "`stiffness` is in Pa",
+        "length": "L is 1 - `contraction` `activation`",
+    },
     "Ground": {
         "mu friction_coefficient": _FRICTION,
         "level offset y z": "the plane is where normal . x is `height` [m]",

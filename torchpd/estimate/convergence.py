@@ -142,8 +142,8 @@ def forecast(
     if spectrum is None or not numbers["weighted"]:
         return None
     if isinstance(solver, Multilevel) and not has_contacts(compiled):
-        body = max(len(body.mesh.vertices) for body in compiled.scene.bodies)
-        reach = min(spectrum.slow * body ** (2.0 / 3.0), 1.0)
+        largest = max(len(body.mesh.vertices) for body in compiled.scene.bodies)
+        reach = min(spectrum.slow * largest ** (2.0 / 3.0), 1.0)
         decade = _LEVELS_LEAST + _LEVELS_SLOPE[solver.outer] * math.log10(1.0 / reach)
         return Forecast(math.log(10.0) / decade)
     theta, rho = numbers["relaxation"], numbers["rho"]

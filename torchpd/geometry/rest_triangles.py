@@ -30,8 +30,11 @@ class RestTriangles:
 class Hinges:
     """Interior edges: corners x0, x1 of the edge, x2 and x3 opposite, with the two triangles.
 
-    c = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04) by the cotangents of the rest angles: c01 at x0 in the first
-    triangle, c02 at x0 in the second, c03 and c04 at x1 (Bergou et al. 2006). sum c_a x_a / A is the curvature vector.
+    The curvature vector is sum c_a x_a / A (Bergou et al. 2006), with weights by the cotangents of rest angles:
+
+        c = (c03 + c04, c01 + c02, -c01 - c03, -c02 - c04)
+
+    c01 and c03 are those of the first triangle at x0 and x1, c02 and c04 those of the second.
     """
 
     corners: Index  # [H, 4]

@@ -13,6 +13,7 @@ from torch.utils._pytree import tree_leaves
 from .. import _C
 from ..common.tables import (
     EFFECT_ROWS,
+    KINDS,
     MATERIAL_TABLE,
     MULTILEVEL_TABLE,
     PLAN_TABLE,
@@ -149,6 +150,14 @@ def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, weighted: bool) -> 
     stiffness, (_, vertex_order, *_) = material[_STIFFNESS], plan
     own = [len(array) for row, array in _elastic_rows(material) if array.dim() > row.dims]
     return stiffness.new_empty((*own[:1], vertex_order.shape[0]))
+
+
+@_register_fake("stiffness_at_rest")
+def _(material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    named, stiffness = named_material(material), material[_STIFFNESS]
+    stencils = [named[kind.rows[0]].shape[-1] for kind in KINDS.values() if kind.rows[0] in named]
+    own = [len(array) for row, array in _elastic_rows(material) if array.dim() > row.dims]
+    return stiffness.new_empty((*own[:1], stiffness.shape[-1] + sum(stencils)))
 
 
 @_register_fake("precondition")

@@ -31,6 +31,9 @@ __all__ = [
     "with_loose_components",
 ]
 
+Index = NDArray[np.int64]
+Reals = NDArray[np.float64]
+
 _WORTH_A_BAR = 200_000  # tetrahedra from which a progress bar is shown
 # in the order of their numbers in the `sizes` of a GPU plan
 KERNELS = ("block", "cluster", "grid", "stream")
@@ -204,6 +207,14 @@ def internal_numbers(vertex_order: NDArray[np.int32]) -> NDArray[np.int32]:
     internal = np.empty_like(vertex_order)
     internal[vertex_order] = np.arange(len(vertex_order), dtype=vertex_order.dtype)
     return internal
+
+
+def stencil_arrays(values: SceneValues) -> list[tuple[int, Index, Reals, Reals, Reals]]:
+    """Stencils of a scene as C++ takes them: number of the kind, corners, g_a, measures, constants."""
+    return [
+        (list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants)
+        for group in values.stencils
+    ]
 
 
 def compile_plan(

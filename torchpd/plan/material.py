@@ -85,8 +85,7 @@ def dims_of(name: str) -> int:
 
 def named_arrays(sim: nn.Module) -> dict[str, Tensor]:
     """Material arrays of a simulator by name: the trainable ones and the mask of hard pins."""
-    names: tuple[str, ...] = sim.material_names
-    return {name: getattr(sim, name) for name in (*names, PIN_HARD)}
+    return {name: getattr(sim, name) for name in (*vars(sim)["material_names"], PIN_HARD)}
 
 
 def material_rows(arrays: Mapping[str, Tensor]) -> list[Tensor]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -52,8 +51,7 @@ def check_rest(guard: MutationGuard, positions: Tensor, scene: Scene) -> Mutatio
     readable = positions.device.type == "cpu" and has_values(positions) and plain_tensor(positions) is positions
     if not readable or positions.is_inference():
         return guard
-    own = np.concatenate([body.mesh.vertices for body in scene.bodies])
-    if not torch.equal(positions, torch.tensor(own, dtype=positions.dtype, device="cpu")):
+    if not torch.equal(positions, torch.tensor(scene.rest_positions, dtype=positions.dtype, device="cpu")):
         raise ValueError(
             "rest_positions must be those of the scene, whose rest shape is compiled, but they were changed: "
             f"restore them, {_ANOTHER_SHAPE}"

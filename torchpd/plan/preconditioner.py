@@ -16,7 +16,7 @@ from ..common.checks import tensor_of
 from ..common.tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE, STENCIL_TABLE
 from ..ops.diagonal import named_material, step_diagonal
 from ..scene.scene import SceneValues
-from .cpu_plan import Plan, compile_progress
+from .cpu_plan import Plan, compile_progress, stencil_arrays
 
 __all__ = [
     "ReferenceMaterial",
@@ -34,16 +34,13 @@ MOST_DIRECT = 1024
 
 ReferenceMaterial = tuple[
     Tensor, Tensor
-]  # Young's modulus [E] Pa, and inertia a [V] N/m in the user's order, inf where pinned
+]  # stiffness at rest [elements], Young's modulus of tetrahedra, and inertia a [V] N/m in the user's order, inf where pinned
 
 
 def has_preconditioner(plan: Sequence[Tensor]) -> bool:
     """Whether the arrays of a CPU or GPU plan include a multilevel preconditioner."""
-    return len(plan) - len(MULTILEVEL_TABLE) in (
-        len(PLAN_TABLE),
-        len(PLAN_TABLE + STENCIL_TABLE),
-        len(DEVICE_PLAN_TABLE),
-    )
+    plans = (PLAN_TABLE, PLAN_TABLE + STENCIL_TABLE, DEVICE_PLAN_TABLE)
+    return len(plan) - len(MULTILEVEL_TABLE) in map(len, plans)
 
 
 def stored_reference(plan: Sequence[Tensor]) -> ReferenceMaterial:
@@ -68,9 +65,9 @@ def reference_material(plan: Plan, material: Sequence[Tensor], time_step: float)
     A vertex counts as pinned where a hard pin holds it in every environment. A uniform scale s costs nothing: M / s is
     exact for an environment whose values are all s times these.
     """
-    stiffness = named_material(material)["stiffness"].detach()
-    arrays = without_preconditioner(plan).arrays
-    inertia, _ = step_diagonal(arrays, [array.detach() for array in material], time_step)
+    arrays, material = without_preconditioner(plan).arrays, [array.detach() for array in material]
+    stiffness = torch.ops.torchpd.stiffness_at_rest(material, list(arrays))
+    inertia, _ = step_diagonal(arrays, material, time_step)
     stiffness = stiffness.amax(0) if stiffness.dim() == 2 else stiffness
     if inertia.dim() == 2:
         largest = torch.where(inertia.isinf(), 0.0, inertia).amax(0)
@@ -104,7 +101,7 @@ def precondition_plan(
     Args:
         plan: on any device.
         values: of the scene that the plan was compiled from.
-        stiffness: Young's modulus [E] Pa.
+        stiffness: at rest [elements]: Young's modulus of tetrahedra [Pa], then that of stencils kind by kind.
         inertia: a of each vertex [V] N/m in the user's order, inf where pinned.
         most_direct: largest number of vertices for which M is A^-1, without levels. None: 0 on the CPU; `MOST_DIRECT`
             on a GPU, but 0 for many environments of a mesh of several patches.
@@ -122,7 +119,7 @@ def precondition_plan(
 
     with compile_progress(len(values.tets), progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_multilevel(
-            values.rest_positions, values.tets, order, rounded(stiffness), rounded(inertia),
+            values.rest_positions, values.tets, stencil_arrays(values), order, rounded(stiffness), rounded(inertia),
             most_direct, plan.kernel is not None, torch.get_num_threads(), advance,
         )  # fmt: skip
     if plan.kernel is not None:

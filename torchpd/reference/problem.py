@@ -6,9 +6,10 @@ quadratic too:
 
     a_i     = m_i / h^2 (1 + damping h) + k_i
     a_i s_i = m_i / h^2 (h v_i + h^2 (g + f_i / m_i)) + k_i (target_i - x_t,i)
-    E(u)    = sum_i a_i / 2 |u_i - s_i|^2 + sum_e w_e V_e / 2 |F_e(x_t + u) - R_e|^2
+    E(u)    = sum_i a_i / 2 |u_i - s_i|^2 + sum_e V_e psi_e(F_e(x_t + u))
 
-with F = sum_a x_a (x) grad N_a and R its nearest rotation. Hard pins hold u_i = target_i - x_t,i and add nothing to E.
+with F = sum_a x_a (x) g_a over the corners of an element and psi by its kind (`reference.kinds`): for tetrahedra with
+nu = 0, w / 2 |F - R|^2 with R the nearest rotation. Hard pins hold u_i = target_i - x_t,i and add nothing to E.
 `reference.solvers` holds the methods that minimise E.
 """
 
@@ -19,113 +20,19 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, csr_array, diags_array, kron
+from scipy.sparse import csr_array, diags_array
 
 from ..common.tables import PLANES, SPHERES
 from ..scene.scene import SceneValues
+from .groups import ElementGroup, groups_of
 from .rigid import align, begin
 from .rigid_piece import gaps_of
+from .rotations import nearest_rotation
 
-__all__ = [
-    "Elements",
-    "StepProblem",
-    "elastic_energy",
-    "elements",
-    "gradient_operator",
-    "kinetic_energy",
-    "nearest_rotation",
-    "nearest_rotation_fast",
-    "potential_energy",
-    "singular_frames",
-    "step_problem",
-]
+__all__ = ["StepProblem", "elastic_energy", "kinetic_energy", "potential_energy", "step_problem"]
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Elements:
-    """Geometry of the tetrahedra, computed from the rest shape."""
-
-    rest_inverse: Array  # [E, 3, 3] Dm^-1, the columns of Dm being the edges x_1 - x_0, x_2 - x_0, x_3 - x_0 [1/m]
-    volumes: Array  # [E] m^3
-    shape_gradients: Array  # [E, 4, 3] grad N_a [1/m]
-    eigenvalue_bound: Array  # [E] l_e = lambda_max(diag(K)^-1/2 K diag(K)^-1/2), K = grad N grad N^T, between 4/3 and 4
-
-
-def elements(rest_positions: Array, tets: Index) -> Elements:
-    """Geometry of linear tetrahedra; grad N_1..3 are the rows of Dm^-1 and grad N_0 is minus their sum."""
-    corners = rest_positions[tets]
-    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    rest_inverse = np.linalg.inv(edges)
-    gradients = np.concatenate([-rest_inverse.sum(axis=1, keepdims=True), rest_inverse], axis=1)
-    directions = gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
-    eigenvalue_bound = np.linalg.eigvalsh(directions @ np.swapaxes(directions, 1, 2))[:, -1]
-    return Elements(np.asarray(rest_inverse, np.float64), np.linalg.det(edges) / 6.0, gradients, eigenvalue_bound)
-
-
-def gradient_operator(shape_gradients: Array, tets: Index, count: int) -> csr_array:
-    """The sparse G [3E, V] with (G x) in rows 3e..3e+2 equal to F_e^T."""
-    rows = np.repeat(np.arange(3 * len(tets)), 4)
-    columns = np.repeat(tets, 3, axis=0).reshape(-1)
-    entries = np.swapaxes(shape_gradients, 1, 2).reshape(-1)
-    return csr_array((entries, (rows, columns)), shape=(3 * len(tets), count))
-
-
-def singular_frames(matrices: Array) -> tuple[Array, Array, Array]:
-    """F = U diag(s) V^T with U and V rotations: s_1 >= s_2 >= |s_3|, and s_3 takes the sign of det F."""
-    left, values, right = np.linalg.svd(matrices)
-    # flip the last singular direction of a frame that reflects, and s_3 with it
-    left_sign, right_sign = np.sign(np.linalg.det(left)), np.sign(np.linalg.det(right))
-    left[..., :, 2] *= left_sign[..., None]
-    right[..., 2, :] *= right_sign[..., None]
-    values[..., 2] *= left_sign * right_sign
-    return left, values, right
-
-
-def nearest_rotation(matrices: Array) -> Array:
-    """The nearest rotation of every F [..., 3, 3]: R with det R = +1 minimises |F - R|; U V^T of the signed SVD."""
-    left, _, right = singular_frames(matrices)
-    return left @ right
-
-
-# indices into a row-major 3x3 matrix: the products of these entries are its cofactors
-_NEXT, _LAST = (1, 2, 0), (2, 0, 1)
-_ENTRIES = [[3 * i + j for i in rows for j in columns] for rows, columns in
-            ((_NEXT, _NEXT), (_LAST, _LAST), (_NEXT, _LAST), (_LAST, _NEXT))]  # fmt: skip
-
-
-def _cofactors(m: Array) -> Array:
-    """Cofactor matrices of m [3, 3, n]: row i is the cross product of the other two rows."""
-    a, b, c, d = (m.reshape(9, -1).take(entries, axis=0) for entries in _ENTRIES)
-    return np.asarray((a * b - c * d).reshape(m.shape))
-
-
-def nearest_rotation_fast(matrices: Array, *, sweeps: int = 9) -> Array:
-    """`nearest_rotation` of F [n, 3, 3], about ten times faster where F is far from singular and not inverted.
-
-    Higham's Newton iteration X <- (X + X^-T) / 2 converges quadratically to the rotation of the polar decomposition
-    when det F > 0 (Higham 1986). The SVD handles matrices for which it has not converged to rounding.
-    """
-    x = np.ascontiguousarray(np.moveaxis(matrices, 0, 2))
-    scale = np.abs(x).max(axis=(0, 1)) ** 3
-    sound = (x[0] * _cofactors(x)[0]).sum(axis=0) > 1e-3 * scale
-    x[:, :, ~sound] = np.eye(3)[:, :, None]
-    change = np.zeros(len(matrices))
-    for _ in range(sweeps):
-        cofactors = _cofactors(x)
-        determinants = (x[0] * cofactors[0]).sum(axis=0)
-        following = 0.5 * (x + cofactors / determinants)
-        change, x = np.abs(following - x).max(axis=(0, 1)), following
-        if change.max(initial=0.0) < 1e-9:  # quadratic convergence: the error is now of the order of 1e-18
-            break
-    rotations = np.ascontiguousarray(np.moveaxis(x, 2, 0))
-    rest = ~sound | (change >= 1e-9)
-    if rest.any():
-        rotations[rest] = nearest_rotation(matrices[rest])
-    return rotations
 
 
 @dataclass(frozen=True)
@@ -143,67 +50,48 @@ class StepProblem:
     sphere_motions: Array  # [S, 3] displacement of the centres during the step
 
     @cached_property
-    def geometry(self) -> Elements:
-        """Geometry of the tetrahedra at rest."""
-        return elements(self.values.rest_positions, self.values.tets)
+    def groups(self) -> tuple[ElementGroup, ...]:
+        """The elements by kind."""
+        return tuple(groups_of(self.values, self.positions, self.time_step))
 
     @cached_property
-    def operator(self) -> csr_array:
-        """G [3E, V]: (G x) in rows 3e..3e+2 is F_e^T."""
-        return gradient_operator(self.geometry.shape_gradients, self.values.tets, len(self.positions))
-
-    @cached_property
-    def _adjoint(self) -> csr_array:
-        return csr_array(self.operator.T)
-
-    @cached_property
-    def element_weight(self) -> Array:
-        """w_e V_e [E] in J."""
-        return self.values.stiffness * self.geometry.volumes
-
-    @cached_property
-    def _start_gradients(self) -> Array:
-        return np.asarray(self.operator @ self.positions)
-
-    def _diagonal(self, factor: Array) -> Array:
-        shares = (factor * self.element_weight)[:, None] * (self.geometry.shape_gradients**2).sum(axis=2)
-        sums = np.bincount(self.values.tets.reshape(-1), weights=shares.reshape(-1), minlength=len(self.positions))
-        return self.weight + sums
+    def joined(self) -> Mask:
+        """Whether an element joins the component to another one [components]."""
+        return joined_components(self.values)
 
     @cached_property
     def plain_diagonal(self) -> Array:
-        """D_i = a_i + sum_e w_e V_e |grad N_i|^2 [V]: the diagonal of A, N/m."""
-        return self._diagonal(np.ones(len(self.element_weight)))
+        """D_i = a_i + sum_e w_e V_e |g_i|^2 [V]: the diagonal of A, N/m."""
+        return self.weight + sum(group.plain_diagonal for group in self.groups)
 
     @cached_property
     def weighted_diagonal(self) -> Array:
-        """Dbar_i = a_i + sum_e l_e w_e V_e |grad N_i|^2 [V], N/m: A <= Dbar on every mesh."""
-        return self._diagonal(self.geometry.eigenvalue_bound)
+        """Dbar_i = a_i + sum_e (q_e l_e + n k_e) V_e |g_i|^2 [V], N/m: no step 1.9 Dbar^-1 grad E raises E."""
+        return self.weight + sum(group.weighted_diagonal for group in self.groups)
 
     @cached_property
     def matrix(self) -> csr_array:
-        """A [V, V] = diag(a) + G^T diag(w V) G: the constant matrix of projective dynamics, the same for every axis."""
-        scaled = diags_array(np.repeat(self.element_weight, 3)) @ self.operator
-        return csr_array(diags_array(self.weight) + self._adjoint @ scaled)
+        """A [V, V] = diag(a) + sum_e w_e V_e g g^T: the constant matrix, the same for every axis.
+
+        w is 2 mu + max(lambda, 0) for solids and membranes, else the stiffness of the element.
+        """
+        matrix = csr_array(diags_array(self.weight))
+        for group in self.groups:
+            matrix = csr_array(matrix + group.matrix)
+        return matrix
 
     @cached_property
     def smallest_ratio(self) -> float:
         """mu = min over free vertices of a_i / Dbar_i <= lambda_min(Dbar^-1 A)."""
         return float(np.min((self.weight / self.weighted_diagonal)[self.free], initial=1.0))
 
-    def deformation_gradients(self, displacement: Array) -> Array:
-        """F [E, 3, 3] at x_t + u."""
-        stacked = self._start_gradients + self.operator @ displacement
-        return np.swapaxes(stacked.reshape(-1, 3, 3), 1, 2)
-
     def evaluate(self, displacement: Array) -> tuple[float, Array]:
         """E(u) [J] and grad E(u) [V, 3] in N, zero at hard pins."""
-        deformation = self.deformation_gradients(displacement)
-        strain = np.swapaxes(deformation - nearest_rotation_fast(deformation), 1, 2)
         pull = np.where(self.free[:, None], displacement - self.target, 0.0)
-        stress = self.element_weight[:, None, None] * strain
-        energy = 0.5 * float(self.weight @ (pull**2).sum(axis=1)) + 0.5 * float((stress * strain).sum())
-        gradient = self.weight[:, None] * pull + self._adjoint @ stress.reshape(-1, 3)
+        energy, gradient = 0.5 * float(self.weight @ (pull**2).sum(axis=1)), self.weight[:, None] * pull
+        for group in self.groups:
+            energies, stress = group.law.evaluate(group.deformation(displacement))
+            energy, gradient = energy + float(energies.sum()), gradient + group.nodal(stress)
         return energy, np.where(self.free[:, None], gradient, 0.0)
 
     def energy(self, displacement: Array) -> float:
@@ -214,28 +102,36 @@ class StepProblem:
         """grad E(u) [V, 3] in N, zero at hard pins."""
         return self.evaluate(displacement)[1]
 
-    def hessian(self, displacement: Array, *, positive: bool = False) -> csr_array:
-        """Exact Hessian [3V, 3V] N/m, with the derivative of the rotation; rows and columns of hard pins included.
+    def hessian_product(self, displacement: Array, direction: Array) -> Array:
+        """H v [V, 3] in N for a direction v [V, 3] m, with the derivative of the rotations; zero at hard pins."""
+        direction = np.where(self.free[:, None], direction, 0.0)
+        product = self.weight[:, None] * direction
+        for group in self.groups:
+            F, dF = group.deformation(displacement), group.change(direction)
+            product = product + group.nodal(group.law.differential(F, dF))
+        return np.where(self.free[:, None], product, 0.0)
 
-        The derivative of |F - R|^2 / 2 is the identity less 2 / (s_i + s_j) on each twist
-        U (e_i e_j^T - e_j e_i^T) V^T / sqrt 2 (Smith, De Goes and Kim 2019). `positive` clamps those eigenvalues,
-        1 - 2 / (s_i + s_j), at zero: the nearest positive semidefinite element Hessian.
+    def hessian(self, displacement: Array, *, positive: bool = False) -> csr_array:
+        """Exact Hessian [3V, 3V] N/m, with the derivative of the rotations; rows and columns of hard pins included.
+
+        `positive` clamps the eigenvalues of every element's Hessian at zero.
         """
-        left, values, right = singular_frames(self.deformation_gradients(displacement))
-        blocks = np.repeat(np.eye(9)[None], len(left), axis=0)
-        for i, j in ((0, 1), (1, 2), (2, 0)):
-            twist = np.zeros((3, 3))
-            twist[i, j], twist[j, i] = np.sqrt(0.5), -np.sqrt(0.5)
-            # the operator acts on F^T, row by row
-            mode = np.swapaxes(left @ twist @ right, 1, 2).reshape(-1, 9)
-            softening = 2.0 / np.maximum(values[:, i] + values[:, j], 1e-12)
-            softening = np.minimum(softening, 1.0) if positive else softening
-            blocks -= softening[:, None, None] * mode[:, :, None] * mode[:, None, :]
-        blocks *= self.element_weight[:, None, None]
-        count = len(blocks)
-        inner = bsr_array((blocks, np.arange(count), np.arange(count + 1)), shape=(9 * count, 9 * count))
-        wide = csr_array(kron(self.operator, np.eye(3)))
-        return csr_array(diags_array(np.repeat(self.weight, 3)) + wide.T @ (inner @ wide))
+        hessian = csr_array(diags_array(np.repeat(self.weight, 3)))
+        for group in self.groups:
+            hessian = csr_array(hessian + group.hessian(displacement, positive=positive))
+        return hessian
+
+    def material_products(self, displacement: Array, direction: Array) -> dict[str, Array]:
+        """v^T dg/dp by the name of the row, g the gradient of E and v [V, 3] zero at hard pins.
+
+        The adjoint -H^-1 dL/du in place of v gives dL/dp of a loss L of the converged step. Shapes are those of the
+        rows. Without a Poisson's ratio in the scene, "poisson" is the derivative at nu = 0.
+        """
+        direction, products = np.where(self.free[:, None], direction, 0.0), dict[str, Array]()
+        for group in self.groups:
+            rates = group.law.products(group.deformation(displacement), group.change(direction))
+            products |= group.material_rows(rates)
+        return products
 
     def first_iterate(self, start: str | Array = "velocity", *, weighted: bool = True) -> Array:
         """u_0 [V, 3] m with pins at their targets, contacts projected and rigid motions applied.
@@ -376,13 +272,24 @@ def step_problem(
     )
 
 
+def joined_components(values: SceneValues) -> Mask:
+    """Whether an element has corners in the component [components] and in another one.
+
+    Its energy would change with a rigid motion of the component.
+    """
+    joined = np.zeros(int(values.component.max()) + 1, dtype=np.bool_)
+    for stencils in getattr(values, "stencils", ()):
+        components = values.component[stencils.corners]
+        joined[components[(components != components[:, :1]).any(axis=1)]] = True
+    return joined
+
+
 def elastic_energy(values: SceneValues, positions: Array) -> float:
-    """Elastic energy sum_e w_e V_e / 2 |F_e - R_e|^2 [J] at positions [V, 3]."""
-    geometry = elements(values.rest_positions, values.tets)
-    corners = positions[values.tets]
-    deformation = np.einsum("eai,eaj->eij", corners, geometry.shape_gradients)
-    strain = deformation - nearest_rotation(deformation)
-    return 0.5 * float(values.stiffness * geometry.volumes @ (strain**2).sum(axis=(1, 2)))
+    """Elastic energy sum_e V_e psi_e(F_e) [J] at positions [V, 3]; damping has none."""
+    groups = groups_of(values, positions, 1.0)
+    still = np.zeros_like(positions)
+    elastic = (group.law.evaluate(group.deformation(still))[0] for group in groups if group.stencils.kind != "damper")
+    return float(sum(energies.sum() for energies in elastic))
 
 
 def potential_energy(values: SceneValues, positions: Array, *, pin_targets: Array | None = None) -> float:

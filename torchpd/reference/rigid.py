@@ -8,6 +8,7 @@ The constraints leave these motions:
 - One plane with friction, or the edge of two planes, leaves the translation along it, shortened by Coulomb's law.
 - On one plane a component may also tip or roll (`reference.tipping`).
 - A component above all planes moves until it reaches the first.
+- An element that joins a component to another one, such as a tie, leaves none.
 
 All other contacts leave no motion. Where a motion ends at a contact, the next one continues from there.
 """
@@ -72,7 +73,7 @@ def begin(problem: Problem, guess: Array, diagonal: Array) -> Array:
 def align(problem: Problem, displacement: Array, nearest_rotation: NearestRotation, *, first: bool = False) -> Array:
     """Displacements [V, 3] m after the rigid motion of every component; `first`: before any iteration."""
     values, moved = problem.values, displacement.copy()
-    for number in range(int(values.component.max()) + 1):
+    for number in np.flatnonzero(~problem.joined):
         of = values.component == number
         for _ in range(LEGS):
             component = RigidComponent(problem, moved, of, nearest_rotation, first)

@@ -55,7 +55,11 @@ def _neighbours(tets: Index, bulk_modulus: Array) -> list[list[int]]:
 
 
 def _grown(neighbours: list[list[int]], count: int, size: int) -> Index:
-    """Grow groups, each from the first unused tet; of equal neighbours that with the fewest unused ones comes first."""
+    """Grow groups, each from the first unused tet.
+
+    Of neighbours that share equally many faces, that with the fewest unused neighbours comes first, then the last one.
+    The first one would pair all tets of a lattice in one direction, which averages less.
+    """
     group = [-1] * count
     number = 0
     for seed in range(count):
@@ -72,7 +76,7 @@ def _grown(neighbours: list[list[int]], count: int, size: int) -> Index:
             if not shared:
                 break
             free = {tet: sum(group[other] < 0 for other in neighbours[tet]) for tet in shared}
-            chosen = min(shared, key=lambda tet: (-shared[tet], free[tet], tet))
+            chosen = min(shared, key=lambda tet: (-shared[tet], free[tet], -tet))
             members.append(chosen)
             group[chosen] = number
         number += 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import FrozenInstanceError
 from typing import TYPE_CHECKING, Any, Literal
@@ -83,19 +84,19 @@ class KeyPart(ScenePart):
         raise FrozenInstanceError(f"cannot delete field {name!r}")
 
 
-class Body(KeyPart):
+class Body(KeyPart, ABC):
     """A part with vertices: a body has a `mesh` with `vertices` [V, 3] m, its rest shape."""
 
     mesh: Any
 
     @property
+    @abstractmethod
     def elements(self) -> Index:
         """Vertex numbers of the elements that hold the body together [E, corners]."""
-        raise NotImplementedError
 
+    @abstractmethod
     def masses(self) -> Array:
         """Lumped masses of the vertices [V] kg."""
-        raise NotImplementedError
 
 
 def check_body(name: str, value: object) -> None:

@@ -113,6 +113,17 @@ class Scene:
         return self._all(Solid)
 
     @property
+    def rest_positions(self) -> Array:
+        """Rest positions of all bodies [V, 3] m."""
+        return np.concatenate([body.mesh.vertices for body in self.bodies])
+
+    @property
+    def tets(self) -> Index:
+        """Corners of the tetrahedra of all solids [E, 4], numbered over the vertices of all bodies."""
+        own = (solid.mesh.tets + self.vertex_range(solid).start for solid in self.solids)
+        return np.concatenate([np.zeros((0, 4), dtype=np.int64), *own])
+
+    @property
     def pins(self) -> tuple[Pin, ...]:
         return self._all(Pin)
 
@@ -157,7 +168,7 @@ class Scene:
     def values(self) -> SceneValues:
         """The flat arrays of the scene, in the user's order."""
         starts = {id(body): self.vertex_range(body).start for body in self.bodies}
-        positions = np.concatenate([body.mesh.vertices for body in self.bodies])
+        positions = self.rest_positions
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
@@ -168,9 +179,7 @@ class Scene:
         poisson, tet_group = self._poisson()
         return SceneValues(
             rest_positions=positions,
-            tets=np.concatenate(
-                [np.zeros((0, 4), dtype=np.int64), *(solid.mesh.tets + starts[id(solid)] for solid in self.solids)]
-            ),
+            tets=self.tets,
             stiffness=np.concatenate([none, *(solid.stiffness for solid in self.solids)]),
             density=np.concatenate([none, *(solid.filled_density for solid in self.solids)]),
             masses=masses,

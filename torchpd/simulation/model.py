@@ -31,7 +31,7 @@ from .material_update import (
     warn_of_new_parameters,
     write_change,
 )
-from .notices import Notices, warn_of_overlaps
+from .notices import Notices, warn_of_scene
 from .pin_mask import PinMask, held_springs, read_pin_mask, serves_any_mask
 from .settings import (
     EVERY_STEP,
@@ -121,7 +121,7 @@ class Model(nn.Module):
         self._adjoint = check_adjoint(adjoint)
         self.progress = progress
         values = scene.values()
-        report_resolution(values, dtype)
+        report_resolution(scene, dtype)
         self.anchors = Anchors(scene)
         self.pinned = values.pinned
         self._rest_guard, self._pin_guard, self._notices = MutationGuard(), MutationGuard(), Notices(self, scene)
@@ -135,7 +135,7 @@ class Model(nn.Module):
                 self.register_parameter(name, nn.Parameter(array, requires_grad=False))
             self.register_buffer(PIN_HARD, hard)
         self._refresh_pin_mask()
-        warn_of_overlaps(scene)
+        warn_of_scene(scene)
         if device is not None:  # first, since "auto" chooses for it
             self.to(device)
         if is_auto(solver):
@@ -452,9 +452,8 @@ class Model(nn.Module):
             self._take(new)
             if loses_positions:
                 # the material may have been trained, so it keeps its digits
-                values = self.scene.values()
-                report_resolution(values, wanted.dtype)
-                self.rest_positions = torch.tensor(values.rest_positions, dtype=wanted.dtype, device=wanted.device)
+                report_resolution(self.scene, wanted.dtype)
+                self.rest_positions = torch.tensor(self.scene.rest_positions, dtype=wanted.dtype, device=wanted.device)
         self._refresh_pin_mask()
         if chooses:
             with persistent_tensors():

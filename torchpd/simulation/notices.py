@@ -17,20 +17,39 @@ from ..common.tables import PLANES, SPHERES
 from ..common.warn import SceneWarning, warn_user
 from ..geometry.overlaps import Overlap, boxes_meet, find_overlaps
 from ..plan.material import CORE_ROWS
+from ..scene.effects import Solid
 from ..scene.scene import Scene
 from .state import State
 
-__all__ = ["Notices", "warn_of_overlaps"]
+__all__ = ["Notices", "warn_of_scene"]
 
 _ROUNDINGS = 10.0  # machine epsilons of a position that a contact may be violated by
 _PLANES, _SPHERES, _GRAVITY = (CORE_ROWS.index(name) for name in ("planes", "spheres", "gravity"))
 _ALONE = "bodies do not collide with each other: move them apart, or separate them by Ground and Sphere"
 
 
-def warn_of_overlaps(scene: Scene) -> None:
-    """Warn of bodies that overlap at rest."""
+def warn_of_scene(scene: Scene) -> None:
+    """Warn of bodies that overlap at rest, and of spheres that fit through the meshes of sheets and rods."""
+    _say_small_spheres(scene)
     if len(scene.solids) > 1:
         _say_overlaps(find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
+
+
+def _say_small_spheres(scene: Scene) -> None:
+    """Only vertices meet a sphere, so that edges longer than its radius may pass through it."""
+    thin = [body for body in scene.bodies if not isinstance(body, Solid)]
+    if not (thin and scene.spheres):
+        return
+    ends = [body.mesh.vertices[body.elements] for body in thin]
+    longest = max(float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max()) for x in ends)
+    radius = min(sphere.radius for sphere in scene.spheres)
+    if radius < longest:
+        warn_user(
+            f"Simulator: a sphere of radius {radius:.3g} m may meet edges of cloth or rods of up to {longest:.3g} m. "
+            "Only their vertices collide, so a sphere passes through such edges: refine the mesh until edges are "
+            "shorter than the radius",
+            SceneWarning,
+        )
 
 
 def _say_overlaps(found: list[Overlap], where: str) -> None:
@@ -112,8 +131,9 @@ class Notices:
     def _look_for_overlaps(self, scene: Scene, positions: Tensor) -> None:
         """Check the first environment in which boxes overlap; at the 1st, 2nd, 4th, 8th ... such report."""
         ranges = [scene.vertex_range(solid) for solid in scene.solids]
-        starts, corners = [part.start for part in ranges], positions.numpy()
-        lows, highs = (end.reduceat(corners, starts, axis=1) for end in (np.minimum, np.maximum))  # [B, bodies, 3]
+        corners = positions.numpy()
+        # [B, bodies, 3]
+        lows, highs = (np.stack([end(corners[:, r], axis=1) for r in ranges], axis=1) for end in (np.min, np.max))
         meet = boxes_meet(lows, highs)
         if not meet.any():
             return
@@ -135,7 +155,7 @@ class Notices:
             return None
         if self._owner is None or self._owner() is not owner or self._scene is None:
             return None
-        vertices = sum(len(solid.mesh.vertices) for solid in self._scene.solids)
+        vertices = sum(len(body.mesh.vertices) for body in self._scene.bodies)
         return self._scene if positions.shape[1:] == (vertices, 3) and len(positions) else None
 
 

@@ -31,7 +31,7 @@ from torch import Tensor
 
 from ..common.checks import to_full_precision
 from ..common.reprs import by_sizes
-from ..common.small_matrices import dot, inverse, length, product
+from ..common.small_matrices import dot, inverse, length, product, tree_sum
 from ..common.tables import PLANES, SPHERES
 from ..ops.adjoint import AdjointCall, step_gradient
 from ..ops.diagonal import named_material, pinned_vertices, step_diagonal
@@ -115,17 +115,6 @@ class Reactions(NamedTuple):
 # ---- sums
 
 
-def _tree_sum(values: Tensor) -> Tensor:
-    """Sum over vertices of [..., n, k] by a binary tree: the same order for any leading dimensions."""
-    if values.shape[-2] == 0:
-        return values.sum(-2)
-    while (count := values.shape[-2]) > 1:
-        half = count // 2
-        pairs = values[..., :half, :] + values[..., half : 2 * half, :]
-        values = torch.cat([pairs, values[..., 2 * half :, :]], dim=-2) if count % 2 else pairs
-    return values[..., 0, :]
-
-
 class _Body(NamedTuple):
     """Vertices of a body, and the point that its torques are about."""
 
@@ -140,7 +129,7 @@ def _bodies(scene: Scene, positions: Tensor, masses: Tensor, about: Tensor | Non
     for body in scene.bodies:
         rows = scene.vertex_range(body)
         own, weights = positions[:, rows], masses[..., rows, None]
-        center = _tree_sum(weights * own) / _tree_sum(weights) if point is None else point
+        center = tree_sum(weights * own) / tree_sum(weights) if point is None else point
         found[body] = _Body(rows, own, center)
     return found
 
@@ -163,8 +152,8 @@ def _checked_point(about: Tensor, positions: Tensor) -> Tensor:
 def _wrench(forces: Tensor, positions: Tensor, about: Tensor) -> Wrench:
     """Sum and torque of forces [B, ..., n, 3] on vertices at positions [B, n, 3]."""
     arms = (positions - about[:, None]).reshape(len(positions), *[1] * (forces.dim() - 3), *positions.shape[1:])
-    torque = _tree_sum(torch.linalg.cross(arms.expand_as(forces), forces))
-    return Wrench(_tree_sum(forces), torque, about)
+    torque = tree_sum(torch.linalg.cross(arms.expand_as(forces), forces))
+    return Wrench(tree_sum(forces), torque, about)
 
 
 # ---- pins

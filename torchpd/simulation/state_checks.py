@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..common.checks import check_like, check_whole, expand_shared, to_full_precision
 from ..common.warn import warn_user
-from ..scene.scene import SceneValues
+from ..scene.scene import Scene
 from .state import State
 
 __all__ = [
@@ -30,8 +30,10 @@ __all__ = [
 ]
 
 
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
 ADJOINTS = ("solver", "multilevel")  # preconditioners of the adjoint of a step
-_WITH_EDGES = ("triangle", "spring")  # kinds whose corners span an element
 _COARSEST = 1e-4  # largest spacing of float32 positions, in shortest edges, without a warning
 _LONGEST_STEP = {torch.float32: 1e12, torch.float64: 1e100}  # s
 
@@ -49,37 +51,34 @@ def check_batch(batch: int | None) -> int | None:
     return None if batch is None else check_whole("batch", batch, minimum=1)
 
 
-def _shortest_edges(positions: NDArray[np.float64], corners: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Shortest edge of each element [N] m."""
-    points = [positions[corners[:, a]] for a in range(corners.shape[1])]
-    edges = (one - other for one, other in combinations(points, 2))
-    return np.asarray(np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges))))
-
-
-def report_resolution(values: SceneValues, dtype: torch.dtype) -> None:
+def report_resolution(scene: Scene, dtype: torch.dtype) -> None:
     """Warn of elements so far from the origin that float32 spacing exceeds 1e-4 of their shortest edge.
 
     Rest shapes are compiled in float64, so rounded positions have strains of that size, which push a body at rest.
     """
     if dtype != torch.float32:
         return
-    kinds = [values.tets, *(group.corners for group in values.stencils if group.kind in _WITH_EDGES)]
-    shortest = np.concatenate([_shortest_edges(values.rest_positions, corners) for corners in kinds])
-    reach = np.abs(values.rest_positions).max(axis=1)
-    farthest = np.concatenate([reach[corners].max(axis=1) for corners in kinds])
-    farthest, shortest = farthest[shortest > 0.0], shortest[shortest > 0.0]  # springs may have no length
-    if not len(shortest):
-        return
+    found = [_shortest_and_farthest(body.mesh.vertices, body.elements) for body in scene.bodies]
+    shortest, farthest = (np.concatenate(part) for part in zip(*found, strict=True))
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows has no resolution
         steps = np.nan_to_num(np.spacing(farthest.astype(np.float32)) / shortest, nan=np.inf)
     worst = int(steps.argmax())
     if steps[worst] > _COARSEST:
+        element, elements = ("a tet", "tets") if len(scene.solids) == len(scene.bodies) else ("an element", "elements")
         warn_user(
             f"Simulator: {farthest[worst]:.4g} m from the origin float32 resolves positions to "
-            f"{steps[worst] * shortest[worst]:.2g} m, {steps[worst]:.2g} of the shortest edge of an element "
-            f"there ({int((steps > _COARSEST).sum())} of {len(steps)} have more than {_COARSEST:g}), so bodies at rest "
-            "will move. Move the scene to the origin with mesh.translated(...), or pass dtype=torch.float64"
+            f"{steps[worst] * shortest[worst]:.2g} m, {steps[worst]:.2g} of the shortest edge of {element} there "
+            f"({int((steps > _COARSEST).sum())} of {len(steps)} {elements} have more than {_COARSEST:g}), so bodies at "
+            "rest will move. Move the scene to the origin with mesh.translated(...), or pass dtype=torch.float64"
         )
+
+
+def _shortest_and_farthest(points: Array, elements: Index) -> tuple[Array, Array]:
+    """Shortest edge of each element [E] m, and its largest coordinate [E] m."""
+    corners = [points[column] for column in elements.T]
+    edges = (one - other for one, other in combinations(corners, 2))
+    shortest = np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges)))
+    return shortest, np.abs(points).max(axis=1)[elements].max(axis=1)
 
 
 def check_positive_number(name: str, value: float, unit: str) -> float:

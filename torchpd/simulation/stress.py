@@ -55,9 +55,7 @@ _REST: WeakKeyDictionary[Scene, dict[tuple[torch.device, torch.dtype], _Rest]] =
 def _rest(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Rest:
     kept = _REST.setdefault(scene, {})
     if (device, dtype) not in kept:
-        starts = [scene.vertex_range(solid).start for solid in scene.solids]
-        tets = np.concatenate([s.mesh.tets + start for s, start in zip(scene.solids, starts, strict=True)])
-        positions = np.concatenate([solid.mesh.vertices for solid in scene.solids])
+        tets, positions = scene.tets, scene.rest_positions
         corners = positions[tets]
         edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
         order = np.argsort(tets.reshape(-1), kind="stable")

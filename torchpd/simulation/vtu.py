@@ -122,19 +122,18 @@ def _instants(time_step: float, times: Sequence[float] | None, count: int) -> li
 def _cells(scene: Scene) -> tuple[NDArray[np.int64], Fields]:
     """Tets [E, 4], and the labels of their bodies and regions."""
     meshes = [solid.mesh for solid in scene.solids]
-    starts = [scene.vertex_range(solid).start for solid in scene.solids]
     labels: Fields = {"body": np.repeat(np.arange(len(meshes)), [len(mesh.tets) for mesh in meshes])}
     if any(mesh.regions is not None for mesh in meshes):
         regions = [np.zeros(len(m.tets), dtype=np.int64) if m.regions is None else m.regions for m in meshes]
         labels["region"] = np.concatenate(regions)
-    return np.concatenate([mesh.tets + start for mesh, start in zip(meshes, starts, strict=True)]), labels
+    return scene.tets, labels
 
 
 @torch.no_grad()
 def _own_fields(compiled: CompiledScene, state: State, chosen: int) -> tuple[Fields, Fields]:
     """Fields of points and cells that every file has."""
     positions = state.positions[chosen]
-    rest = positions.new_tensor(np.concatenate([solid.mesh.vertices for solid in compiled.scene.solids]))
+    rest = positions.new_tensor(compiled.scene.rest_positions)
     stiffness = compiled.named["stiffness"].expand(len(state.positions), -1)[chosen]
     found = stress(compiled.scene, positions[None], stiffness)
     points = {"displacement": positions - rest, "velocity": state.velocities[chosen]}

@@ -24,14 +24,15 @@ class FieldPass {
     if (call_.field == Field::gradient) {
       vertex_field<1, 3>(environment, elastic_gradient<false>());
     } else if (call_.field == Field::diagonal) {
-      vertex_field<1, 1>(environment,
-                         Elements{SolidDiagonal{}, StencilDiagonal{call_.weighted}});
+      vertex_field<1, 1>(environment, Elements{SolidDiagonal{}, StencilDiagonal{call_.weighted}});
     } else if (call_.field == Field::report) {
       vertex_field<1, 3>(environment, Elements{SolidReport{}, StencilReport{}});
     } else if (call_.field == Field::hessian_product) {
       vertex_field<2, 3>(environment, Elements{SolidHessian{}, StencilHessian{}});
     } else if (call_.field == Field::effect_energy) {
       sum_energy(environment);
+    } else if (call_.field == Field::stiffness_at_rest) {
+      write_stiffness(environment);
     } else if (call_.field == Field::effect_products) {
       differentiate_by_effects(environment);
     } else if (call_.field == Field::element_energy) {
@@ -87,6 +88,19 @@ class FieldPass {
     call_.out[environment] = T(sum);
   }
 
+  void write_stiffness(std::int64_t environment) {
+    std::int64_t elements = plan_.tets;
+    for (int k = 0; plan_.stencil_blocks && k < int(KindNumber::count); ++k)
+      elements += plan_.stencil_sizes[stencil_size_count + k];
+    T* const out = call_.out + environment * elements;
+    const T* const stiffness = call_.stiffness.of(environment);
+    for (std::int64_t t = team_.begin(plan_.tets); t < team_.end(plan_.tets); ++t)
+      out[t] = stiffness[t];
+    each_stencil_stiffness(plan_, call_.effects, environment, team_.begin(plan_.stencil_blocks),
+                           team_.end(plan_.stencil_blocks),
+                           [&](T w, std::int64_t n) { out[n] = w; });
+  }
+
   // Each stencil writes to its own row.
   void differentiate_by_effects(std::int64_t environment) {
     for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
@@ -94,8 +108,7 @@ class FieldPass {
                       : sweep_.template gather_slots<1>(patch);
       each_stencil<Batch<T, 1>>(plan_, patch, [&](auto kind, const StencilPart<T>& part) {
         using Kind = decltype(kind);
-        if (plan_.stencil_measure[part.stencil()] != T(0))
-          write_products<Kind>(environment, part);
+        if (plan_.stencil_measure[part.stencil()] != T(0)) write_products<Kind>(environment, part);
       });
     }
   }

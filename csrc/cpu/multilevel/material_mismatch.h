@@ -1,5 +1,6 @@
 // Runner of measure_mismatch (solver/multilevel/material_mismatch.h) on the CPU.
 #pragma once
+#include "cpu/step/stencil_blocks.h"
 #include "solver/multilevel/material_mismatch.h"
 #include "threads/team.h"
 
@@ -10,13 +11,19 @@ namespace pd::inline PD_TARGET {
 template <class T, class Inertia>
 struct MismatchRunner {
   const Plan<T>& plan;
+  const StepCall<T>& call;
+  std::int64_t environment;
   const Team& team;
   Range (*ranges)[ranges_count];  // one row a thread
   Inertia inertia;
 
   template <class Visit>
-  void each_tet(const Visit& visit) const {
-    for (std::int64_t t = team.begin(plan.tets); t < team.end(plan.tets); ++t) visit(t);
+  void each_element(const Visit& visit) const {
+    const T* stiffness = call.material.stiffness.of(environment);
+    for (std::int64_t t = team.begin(plan.tets); t < team.end(plan.tets); ++t)
+      visit(stiffness[t], t);
+    each_stencil_stiffness(plan, call.effects, environment, team.begin(plan.stencil_blocks),
+                           team.end(plan.stencil_blocks), visit);
   }
 
   template <class Visit>

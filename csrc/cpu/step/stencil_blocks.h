@@ -83,6 +83,30 @@ struct StencilsAcross<Kind, Fields, Batch<T, W>> {
   }
 };
 
+// visit(w, n) for every stencil of some blocks: its stiffness at rest per measure, and its number after the
+// tetrahedra, kind by kind.
+template <class T, class Visit>
+void each_stencil_stiffness(const Plan<T>& plan, const Effects<T>& effects,
+                            std::int64_t environment, std::int64_t begin, std::int64_t end,
+                            const Visit& visit) {
+  for (std::int64_t b = begin; b < end; ++b) {
+    const int number = plan.stencil_block[4 * b];
+    std::int64_t first = plan.tets;
+    for (int k = 0; k < number; ++k) first += plan.stencil_sizes[stencil_size_count + k];
+    with_kind(number, [&](auto kind) {
+      using Kind = decltype(kind);
+      const MaterialRows<Kind, T> rows(effects, environment);
+      for (int lane = 0; lane < block_lanes; ++lane) {
+        const StencilPart<T> part{&plan, int(b), lane};
+        if (plan.stencil_measure[part.stencil()] == T(0)) continue;
+        T numbers[Kind::numbers];
+        rows.read(plan.stencil_order[part.stencil()], T(1), numbers);
+        visit(Kind::weight(numbers, T(1), T(1)), first + plan.stencil_order[part.stencil()]);
+      }
+    });
+  }
+}
+
 // Lanes that a pack of one environment holds; a pack of several holds one stencil.
 template <class Lanes>
 constexpr int stencil_lanes = 1;

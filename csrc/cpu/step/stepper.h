@@ -119,10 +119,11 @@ class Stepper {
     }
     const bool guard = schedule_[0].checks_energy(k);
     if (guard) {
-      sweep_.run(k & 1, elastic_gradient<true>(), [&](std::int64_t i, const Value& force, Sum& sums) {
-        sums.energy = vertex(i).add_energy(w_.u[i], sums.energy);
-        update(i, force, sums);
-      });
+      sweep_.run(k & 1, elastic_gradient<true>(),
+                 [&](std::int64_t i, const Value& force, Sum& sums) {
+                   sums.energy = vertex(i).add_energy(w_.u[i], sums.energy);
+                   update(i, force, sums);
+                 });
     } else {
       sweep_.run(k & 1, elastic_gradient<false>(),
                  [&](std::int64_t i, const Value& force, Sum& sums) { update(i, force, sums); });

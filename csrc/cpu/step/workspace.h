@@ -59,7 +59,7 @@ struct Workspace {
   TippingSearch<Real>* search;  // [components]
   Plane<Real>* planes;
   Sphere<Real>* spheres;
-  T* weight;  // [elements], or [elements, W] when stiffness differs between environments
+  T* weight;   // [elements], or [elements, W] when stiffness differs between environments
   T* numbers;  // the same of stencils: [rows of 16 numbers of a step]
   int part_count;
   bool shared_weight;

@@ -249,6 +249,7 @@ void run_field_with(const FieldWork<T>& work, cudaStream_t stream) {
       return launch_field(field_elements<Computed, true, T>, work, 2, stream);
     case Field::effect_energy:
     case Field::effect_products:
+    case Field::stiffness_at_rest:
       return;  // only run_mixed_field has them
   }
 }

@@ -94,6 +94,36 @@ __global__ void __launch_bounds__(field_threads)
                      });
 }
 
+// The stiffness at rest of tetrahedra, then of stencils kind by kind, per measure.
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    element_stiffness(const __grid_constant__ MixedFieldWork<T> work, std::int64_t elements) {
+  const DeviceStencils<T>& plan = work.stencils.plan;
+  const std::int64_t tets = work.field.plan.tets;
+  const std::int64_t blocks = (tets + stencil_lanes - 1) / stencil_lanes + plan.blocks;
+  const std::int64_t thread = std::int64_t(blockIdx.x) * field_threads + threadIdx.x;
+  const std::int64_t environment = thread / stencil_lanes / blocks;
+  if (environment >= work.field.batch) return;
+  T* const out = work.field.out + environment * elements;
+  const std::int64_t block = thread / stencil_lanes % blocks;
+  if (block >= plan.blocks) {
+    const std::int64_t t = (block - plan.blocks) * stencil_lanes + thread % stencil_lanes;
+    if (t < tets) out[t] = work.field.stiffness.of(environment)[t];
+    return;
+  }
+  const StencilPlace<T> place(plan, int(block));
+  if (plan.stencil_measure[place.stencil()] == T(0)) return;  // padding
+  std::int64_t first = tets;
+  for (int kind = 0; kind < place.block.kind; ++kind) first += work.counts[kind];
+  const int number = plan.stencil_order[place.stencil()];
+  with_kind(place.block.kind, [&](auto kind) {
+    using Kind = decltype(kind);
+    T numbers[Kind::numbers];
+    MaterialRows<Kind, T>(work.effects.effects, environment).read(number, T(1), numbers);
+    out[first + number] = Kind::weight(numbers, T(1), T(1));
+  });
+}
+
 // instantiated in fields_float.cu and fields_double.cu
 extern template void run_field(const DeviceField<float>&, void*, Stream);
 extern template void run_field(const DeviceField<double>&, void*, Stream);
@@ -132,6 +162,19 @@ void run_energies(const MixedFieldWork<T>& work, cudaStream_t stream) {
   check(cudaGetLastError());
 }
 
+template <class T>
+void run_stiffness(const MixedFieldWork<T>& work, cudaStream_t stream) {
+  const std::int64_t tets = work.field.plan.tets;
+  std::int64_t elements = tets;
+  for (const int count : work.counts) elements += count;
+  const std::int64_t blocks =
+      work.stencils.plan.blocks + (tets + stencil_lanes - 1) / stencil_lanes;
+  const std::int64_t threads = work.field.batch * blocks * stencil_lanes;
+  element_stiffness<T><<<blocks_of((threads + field_threads - 1) / field_threads), field_threads, 0,
+                         stream>>>(work, elements);
+  check(cudaGetLastError());
+}
+
 template <bool Computed, class T>
 void run_mixed_field_with(const MixedFieldWork<T>& work, cudaStream_t stream) {
   compute_field_weights<Computed, T>(work, stream);
@@ -157,6 +200,7 @@ void run_mixed_field(const MixedField<T>& field, void* memory, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
   Arena arena(memory);
   const MixedFieldWork<T> work = arrange_mixed(arena, field);
+  if (field.field == Field::stiffness_at_rest) return run_stiffness(work, stream);
   compute_stencil_numbers(work.stencils, field.effects, field.batch, stream);
   if (field.field == Field::effect_energy) return run_energies(work, stream);
   if (field.field == Field::effect_products) {

@@ -40,9 +40,9 @@ __global__ void __launch_bounds__(multilevel_threads)
   Range* const ranges = of_team(call, number).ranges;
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
     const StreamWork<T, false> w(call.stream, e);
-    MismatchRunner<T> run(w, ranges, team);
     const T* stiffness = call.stream.step.material.stiffness.of(e);
-    const MaterialMismatch mismatch = measure_mismatch(run, w.plan.levels, stiffness);
+    MismatchRunner<T> run(w, stiffness, ranges, team);
+    const MaterialMismatch mismatch = measure_mismatch(run, w.plan.levels);
     if (team.thread() == 0) call.memory.mismatch[e] = mismatch;
   }
 }

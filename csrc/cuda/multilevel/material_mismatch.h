@@ -8,13 +8,14 @@ namespace pd::inline PD_TARGET {
 template <class T>
 class MismatchRunner {
  public:
-  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, Range* memory, BlockTeam& team)
-      : w_(w), memory_(memory), team_(team) {}
+  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, const T* stiffness, Range* memory,
+                           BlockTeam& team)
+      : w_(w), stiffness_(stiffness), memory_(memory), team_(team) {}
 
   template <class Visit>
-  PD_DEVICE void each_tet(const Visit& visit) const {
+  PD_DEVICE void each_element(const Visit& visit) const {
 #pragma unroll 1
-    for (int t = team_.thread(); t < w_.plan.tets; t += team_.threads()) visit(t);
+    for (int t = team_.thread(); t < w_.plan.tets; t += team_.threads()) visit(stiffness_[t], t);
   }
 
   template <class Visit>
@@ -54,6 +55,7 @@ class MismatchRunner {
 
  private:
   const StreamWork<T, false>& w_;
+  const T* stiffness_;
   Range* memory_;
   BlockTeam& team_;
   int round_ = 0;

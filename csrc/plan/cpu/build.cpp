@@ -69,9 +69,9 @@ void add_stencils(MeshPlan& plan, const StencilGroup& group, std::span<const std
   for (std::int64_t b = 0; b < blocks; ++b) {
     const auto rows = [](const auto& array) { return std::int32_t(array.size() / lanes); };
     const std::size_t corner = plan.stencil_corner.size(), number = plan.stencil_stored.size();
-    plan.stencil_block.insert(plan.stencil_block.end(),
-                              {group.kind, rows(plan.stencil_corner), rows(plan.stencil_stored),
-                               plan.stencil_numbers});
+    plan.stencil_block.insert(
+        plan.stencil_block.end(),
+        {group.kind, rows(plan.stencil_corner), rows(plan.stencil_stored), plan.stencil_numbers});
     plan.stencil_numbers += group.numbers;
     plan.stencil_corner.resize(corner + group.corners * lanes);
     plan.stencil_stored.resize(number + stored * lanes);

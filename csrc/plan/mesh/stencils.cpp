@@ -49,7 +49,8 @@ std::vector<double> stored_gradients(const StencilGroup& group, std::int64_t s) 
   if (d == 3 && dot(cross(axes[0], axes[1]), axes[2]) < 0) axes[0] = -axes[0];
   std::vector<double> numbers;
   for (int j = 0; j < d; ++j) {
-    for (int a = 0; a < n - d + j; ++a) numbers.push_back(dot(axes[j], gradient_of(group, s, a + 1)));
+    for (int a = 0; a < n - d + j; ++a)
+      numbers.push_back(dot(axes[j], gradient_of(group, s, a + 1)));
   }
   return numbers;
 }

@@ -1,10 +1,11 @@
 // Builds the multilevel approximation of A^-1 for a scene: the arrays of multilevel.def.
 //
-// A = diag(a) + sum_e w_e V_e grad N grad N^T is constant, so this happens once. The method is smoothed aggregation
+// A = diag(a) + sum_e w_e V_e G G^T is constant, so this happens once. The method is smoothed aggregation
 // (Vanek, Mandel and Brezina 1996) with the affine functions as near-nullspace. They represent rigid motions and
 // uniform strains of an aggregate exactly.
 #pragma once
 
+#include "plan/mesh/elements.h"
 #include "views/views.h"
 
 #include <cstdint>
@@ -15,12 +16,9 @@ namespace pd {
 
 // The scene, checked by the caller; in the user's numbers but for `vertex_order` (internal number -> user's number).
 struct MultilevelScene {
-  const double* positions;  // [vertices, 3] at rest
-  std::int64_t vertices;
-  const std::int64_t* tets;  // [count, 4] of positive volume
-  std::int64_t count;
+  MeshElements elements;
   const std::int32_t* vertex_order;  // [vertices]
-  const double* stiffness;           // [count] Pa
+  const double* stiffness;           // [elements] at rest: Young's modulus of a tetrahedron [Pa]
   const double* inertia;             // [vertices] a, inf where a pin holds the vertex exactly [N/m]
   std::int64_t most_direct;  // largest mesh without levels, where M is A^-1 itself [vertices]
   bool folded;               // prolongation with smoothing folded in, for a GPU

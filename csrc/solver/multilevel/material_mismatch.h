@@ -49,17 +49,18 @@ struct MaterialMismatch {
 
 constexpr int ranges_count = 2;  // ranges that threads reduce at a time
 
-// Measures with all threads of a team. The runner supplies each_tet(visit(t)) and each_vertex(visit(i, a)) over the
-// thread's share, with a = 0 where the step holds the vertex. Its reduce(ranges) combines the ranges of all threads.
+// Measures with all threads of a team. The runner supplies each_element(visit(w, n)), w the stiffness at rest of the
+// element whose reference is the n-th, and each_vertex(visit(i, a)) over the thread's share, with a = 0 where the step
+// holds the vertex. Its reduce(ranges) combines the ranges of all threads.
 #if defined(__CUDACC__)
 #pragma nv_exec_check_disable
 #endif
 template <class Runner, class T>
-PD_HD MaterialMismatch measure_mismatch(Runner& run, const Levels<T>& levels, const T* stiffness) {
+PD_HD MaterialMismatch measure_mismatch(Runner& run, const Levels<T>& levels) {
   Range first[ranges_count], second[ranges_count];
   Range &elements = first[0], &inertias = first[1], &common = second[0], &differ = second[1];
-  run.each_tet([&](std::int64_t t) {
-    elements.count(double(stiffness[t]) / double(levels.reference_stiffness[t]));
+  run.each_element([&](T stiffness, std::int64_t n) {
+    elements.count(double(stiffness) / double(levels.reference_stiffness[n]));
   });
   // visit(a / a_0) for vertices that neither the step nor M holds; counts those that only one of them holds
   const auto each_inertia = [&](const auto& visit) {
