@@ -393,7 +393,7 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   progress(0.2);
   for (const double bound : fine.bound) t.fine_inverse.push_back(bound > 0 ? 1 / bound : 0);
   t.reference_stiffness.assign(scene.stiffness, scene.stiffness + scene.elements.count());
-  for (std::int64_t i = 0; i < scene.elements.elements.vertices; ++i)
+  for (std::int64_t i = 0; i < scene.elements.vertices; ++i)
     t.reference_inertia.push_back(scene.inertia[scene.vertex_order[i]]);
   t.level_sizes.assign(level_size_count, 0);
   t.level_sizes[level_fine_entries] = fine.matrix.start.back();
@@ -401,10 +401,10 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   const Graph graph = coupling_graph(
       fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0));
   t.turning_weight = turning_weights(graph, fine.held, rest.position);
-  if (scene.elements.elements.vertices <= scene.most_direct) {
+  if (scene.elements.vertices <= scene.most_direct) {
     t.level_sizes[level_direct] = 1;
     t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
-    t.fine_prolongation_start.assign(std::size_t(scene.elements.elements.vertices) + 1, 0);
+    t.fine_prolongation_start.assign(std::size_t(scene.elements.vertices) + 1, 0);
     t.fine_node_start = {0};
     store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
     progress(1.0);
