@@ -299,7 +299,7 @@ def test_newton_krylov_holds_and_frees_what_the_step_does(problem: StepProblem) 
 def test_memory_is_watched_and_contacts_are_refused(problem: StepProblem) -> None:
     trace = run_baseline(BASELINES["direct global step"], problem, problem.first_iterate(), 2, memory=True)
     # at least the iterates that are kept, and the sparse operator
-    assert trace.peak_bytes > problem.operator.data.nbytes
+    assert trace.peak_bytes > problem.groups[0].operator.data.nbytes
     resting = contact_block(pd.Ground(0.0)).problem()
     with pytest.raises(ValueError, match=r"no contacts.*1 planes"):
         run_baseline(BASELINES["Newton"], resting, resting.first_iterate(), 1)

@@ -234,7 +234,7 @@ def test_the_adjoint_of_a_rollout_checks_what_it_gets() -> None:
             torch.ops.torchpd.rollout_vjp(none, none, none, none, first, speed, forces, arrays, plan, time_step=h)
     with pytest.raises(ValueError, match=r"rollout_vjp: wanted .*got 1 numbers"):
         torch.ops.torchpd.rollout_vjp(x, v, x, v, *state, None, arrays, plan, time_step=sim.time_step, wanted=[True])
-    with pytest.raises(ValueError, XX):
+    with pytest.raises(ValueError, match=r"material must be .*got 2"):
         torch.ops.torchpd.rollout_vjp(x, v, x, v, *state, None, arrays[:2], plan, time_step=sim.time_step)
 
 

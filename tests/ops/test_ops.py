@@ -77,12 +77,9 @@ def test_fields_are_those_of_the_reference(scale: float, dtype: torch.dtype, dev
     problem = rounded_problem(Case(case.scene, x, 0.0 * x, case.time_step), torch.float64)
     direction = noise(seen)
     d = direction[0].double().cpu().numpy()
-    deformation = problem.deformation_gradients(0.0 * x)
-    strain = deformation - pd.reference.nearest_rotation(deformation)
-    energies = 0.5 * problem.element_weight * (strain**2).sum(axis=(1, 2))
-    stress = np.swapaxes(problem.element_weight[:, None, None] * strain, 1, 2).reshape(-1, 3)
-    gradient = problem.operator.T @ stress
-    slopes = ((problem.operator @ d) * stress).reshape(-1, 9).sum(axis=1)
+    solids = problem.groups[0]
+    energies, stress = solids.law.evaluate(solids.deformation(0.0 * x))
+    gradient, slopes = solids.nodal(stress), (solids.change(d) * stress).sum(axis=(1, 2))
     weight = np.repeat(problem.weight, 3)
     product = (problem.hessian(0.0 * x) @ d.reshape(-1) - weight * d.reshape(-1)).reshape(-1, 3)
 

@@ -51,9 +51,10 @@ GROUPS = np.arange(COUNT) // 4
 
 
 def smooth_states(rng: np.random.Generator, width: int) -> Array:
-    """F [N, 3, d] of moderate stretches, half of them inverted, some beyond the cap."""
+    """F [N, 3, d] of moderate stretches, half of them inverted, some beyond the cap, some with equal stretches."""
     stretches = rng.uniform(0.3, 1.5, (COUNT, 3)) * rng.choice([1.0, 2.0], (COUNT, 1))
     stretches[::2, 2] *= -1.0
+    stretches[1::10] = rng.uniform(0.4, 1.4, (COUNT // 10, 1))
     return ((random_rotations(rng, COUNT) * stretches[:, None]) @ random_rotations(rng, COUNT))[:, :, :width]
 
 
@@ -71,7 +72,7 @@ def by_group(values: Array) -> Array:
     return np.bincount(GROUPS, weights=values)
 
 
-STEP = 1e-5
+STEP = 3e-6
 
 
 def check_derivative(function: Callable[[float], Array], expected: Array) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from element_cases import random_rotations
-from stencil_scenes import PLASTIC_ALPHA, PLASTIC_FORCES, plastic_bar, with_stencils
+from stencil_scenes import PLASTIC_ALPHA, PLASTIC_FORCES, plastic_bar
 
 from torchpd.reference import step_problem
 from torchpd.reference.plastic import Flow, PlasticLaw, flow, flow_product, flowed, uniaxial_yield
@@ -86,7 +88,7 @@ def test_bar_beyond_its_yield() -> None:
     for number, end in enumerate(ends, start=1):
         targets = values.pin_targets + np.where(right, end - 1.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
         elements = flowed(bar, state.plastic)
-        mixed = with_stencils(values, stencils=(elements,))
+        mixed = replace(values, stencils=(elements,))
         problem = step_problem(mixed, x, np.zeros_like(x), 1.0 / 30.0, pin_targets=targets)
         u = newton(problem, problem.first_iterate("velocity"))
         group = problem.groups[0]

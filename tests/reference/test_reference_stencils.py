@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import contact_block, rotation
+from cases import box, contact_block, rotation
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 from stencil_scenes import (
@@ -18,7 +18,6 @@ from stencil_scenes import (
     SOLID_CASES,
     SolidCase,
     StencilScene,
-    StencilValues,
     bare_values,
     capped_box,
     chain,
@@ -34,13 +33,14 @@ from stencil_scenes import (
     sheet,
     small_beam,
     springs,
-    with_stencils,
 )
 
+import torchpd as pd
 from torchpd.reference import Array, StepProblem, elastic_energy, elements, step_problem
 from torchpd.reference.groups import ElementGroup
 from torchpd.reference.laws import Corotated
 from torchpd.reference.solvers import guarded_chebyshev, jacobi, newton, preconditioned_lbfgs, relative_error
+from torchpd.scene import SceneValues
 
 SCENES: dict[str, Callable[[], StencilScene]] = {
     "spring": pulled_spring,
@@ -164,7 +164,7 @@ def every_kind(seed: int = 0) -> tuple[StepProblem, Array]:
         of_tets("damper", values, np.arange(count), viscosity=1e3),
         of_tets("plastic", values, np.arange(5), plastic_youngs=1e5, plastic_poisson=0.3),
     )
-    mixed = with_stencils(
+    mixed = replace(
         values,
         stencils=groups,
         stiffness=1e5 * size,
@@ -209,9 +209,8 @@ def test_material_products_are_derivatives_of_the_gradient() -> None:
     problem, u = every_kind()
     v = np.random.default_rng(2).standard_normal(u.shape)
     products, values = problem.material_products(u, v), problem.values
-    assert isinstance(values, StencilValues)
 
-    def along(values: StencilValues) -> float:
+    def along(values: SceneValues) -> float:
         return float((replace(problem, values=values).gradient(u) * v).sum())
 
     for stencils in values.stencils:
@@ -231,6 +230,48 @@ def test_material_products_are_derivatives_of_the_gradient() -> None:
         assert (by_youngs[0] - by_youngs[1]) / 2.0 == pytest.approx(products["stiffness"][number], rel=1e-5)
         by_nu = [along(replace(values, poisson=poisson + h * one)) for h in (1e-6, -1e-6)]
         assert (by_nu[0] - by_nu[1]) / 2e-6 == pytest.approx(products["poisson"][number], rel=1e-5)
+
+
+def test_a_scene_of_all_bodies_falls_as_one() -> None:
+    """Elements only exchange momentum: the common centre of mass falls freely. Chebyshev finds Newton's solution."""
+    vertices, tets = box((0.3, 0.3, 0.3), (2, 2, 2))
+    solid = pd.Solid(pd.TetMesh(vertices, tets), youngs=1e4, poisson=0.4)
+    positions, triangles = sheet((0.3, 0.3), (4, 4))
+    cloth = pd.Cloth(pd.TriMesh(positions + [0.0, 0.35, 0.0], triangles), 1e5, 1e-3, 0.2)
+    rod = pd.Rod([(0.05 * k, 0.5, 0.0) for k in range(7)], 1e6, 0.005)
+    scene = pd.Scene(
+        solid,
+        cloth,
+        rod,
+        pd.Fibres(solid, (1.0, 0.0, 0.0), 1e4, activation=1.0),
+        pd.Tie(cloth, [0, 4], solid, [(0.0, 0.3, 0.0), (0.0, 0.3, 0.3)], stiffness=1e3),
+        pd.Springs(rod, [(0, 0), (6, 20)], 100.0, other=cloth),
+        pd.Gravity((0.0, -9.8, 0.0)),
+    )
+    values = scene.values()
+    start = values.rest_positions + 0.01 * np.random.default_rng(0).standard_normal(values.rest_positions.shape)
+    problem = step_problem(values, start, np.zeros_like(start), 0.02)
+    first = problem.first_iterate("inertial")
+    u = newton(problem, first)
+    np.testing.assert_allclose(values.masses @ u / values.masses.sum(), [0.0, -9.8 * 0.02**2, 0.0], atol=1e-10)
+    assert problem.joined.tolist() == [True, True, True]
+    assert relative_error(guarded_chebyshev(problem, first, iterations=1000).displacement, u, first) <= 1e-3
+
+
+def test_cloth_of_a_scene_has_the_energies_of_its_formulas() -> None:
+    """Membrane and hinges made by `Cloth` against those made here, on a disturbed sheet."""
+    rng = np.random.default_rng(0)
+    positions, triangles = sheet((0.5, 0.3), (5, 3))
+    positions = positions + 0.02 * rng.standard_normal(positions.shape) * [1.0, 0.0, 1.0]
+    own = [membrane(positions, triangles, 2e3, 0.2), hinges(positions, triangles, 1e-3)]
+    values = pd.Scene(pd.Cloth(pd.TriMesh(positions, triangles), 1e6, 2e-3, 0.2, poisson=0.2, bending=1e-3)).values()
+    moved = positions + 0.05 * rng.standard_normal(positions.shape)
+    expected = replace(values, stencils=tuple(own))
+    problems = [step_problem(of, moved, np.zeros_like(moved), 0.01) for of in (values, expected)]
+    still = np.zeros_like(moved)
+    np.testing.assert_allclose(*(problem.gradient(still) for problem in problems), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(*(problem.weighted_diagonal for problem in problems), rtol=1e-12)
+    np.testing.assert_allclose(values.masses, cloth_masses(positions, triangles, 0.2), rtol=1e-12)
 
 
 def sensitivities(scene: StencilScene, vertices: Array, axis: int) -> tuple[float, dict[str, Array]]:
@@ -286,7 +327,7 @@ def test_joined_components_have_no_rigid_motion_of_their_own() -> None:
     scene = chain()
     halves = (np.arange(21) > 10).astype(np.int64)
     apart = bare_values(scene.values.rest_positions, scene.values.masses, (), np.array([0]), component=halves)
-    joined = with_stencils(apart, stencils=scene.problem().values.stencils)
+    joined = replace(apart, stencils=scene.problem().values.stencils)
     problem = step_problem(joined, joined.rest_positions, scene.velocities, scene.time_step)
     assert problem.joined.tolist() == [True, True]
     guess = 0.001 * np.random.default_rng(0).standard_normal((21, 3))

@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ..common.tables import KINDS
 from ..ops.diagonal import named_material
 from ..scene.pins import PinnedComponents
 from ..scene.scene import Scene
@@ -69,6 +70,11 @@ class CompiledScene:
     def named(self) -> dict[str, Tensor]:
         """The material by name."""
         return named_material(self.material)
+
+    @cached_property
+    def has_stencils(self) -> bool:
+        """Whether the scene has elements besides tetrahedra: cloth, springs, fibres, and the like."""
+        return any(kind.rows[0] in self.named and self.named[kind.rows[0]].numel() > 0 for kind in KINDS.values())
 
     @property
     def environments(self) -> int:

@@ -14,7 +14,7 @@ from torch import Tensor
 from .. import _C
 from ..common.checks import tensor_of
 from ..common.tables import DEVICE_PLAN_TABLE, MULTILEVEL_TABLE, PLAN_TABLE, STENCIL_TABLE
-from ..ops.diagonal import named_material, step_diagonal
+from ..ops.diagonal import step_diagonal
 from ..scene.scene import SceneValues
 from .cpu_plan import Plan, compile_progress, stencil_arrays
 
@@ -32,9 +32,9 @@ __all__ = [
 # blocks. With many environments of one or two blocks each, the V-cycle is faster, except on a mesh of one patch.
 MOST_DIRECT = 1024
 
-ReferenceMaterial = tuple[
-    Tensor, Tensor
-]  # stiffness at rest [elements], Young's modulus of tetrahedra, and inertia a [V] N/m in the user's order, inf where pinned
+# Stiffness at rest [elements], of tetrahedra Young's modulus [Pa]; inertia a [V] N/m in the user's order, inf where
+# pinned
+ReferenceMaterial = tuple[Tensor, Tensor]
 
 
 def has_preconditioner(plan: Sequence[Tensor]) -> bool:

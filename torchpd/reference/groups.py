@@ -119,7 +119,7 @@ class ElementGroup:
 
 def tetrahedra(values: SceneValues) -> StencilGroup:
     """The tetrahedra of the solids as a group of kind "tet", with nu = 0 where the scene has no Poisson's ratio."""
-    shape, poisson = elements(values.rest_positions, values.tets), getattr(values, "poisson", None)
+    shape = elements(values.rest_positions, values.tets)
     return StencilGroup(
         kind="tet",
         corners=values.tets,
@@ -128,7 +128,7 @@ def tetrahedra(values: SceneValues) -> StencilGroup:
         constants=np.zeros((len(values.tets), 0)),
         material={
             "stiffness": values.stiffness,
-            "poisson": np.zeros(len(values.tets)) if poisson is None else poisson,
+            "poisson": np.zeros(len(values.tets)) if values.poisson is None else values.poisson,
         },
     )
 
@@ -136,8 +136,7 @@ def tetrahedra(values: SceneValues) -> StencilGroup:
 def groups_of(values: SceneValues, positions: Array, time_step: float) -> Iterator[ElementGroup]:
     """The tetrahedra, if there are any, then every group of stencils."""
     if len(values.tets):
-        joined = getattr(values, "tet_group", None)
-        group = np.arange(len(values.tets)) if joined is None else joined
+        group = np.arange(len(values.tets)) if values.tet_group is None else values.tet_group
         yield ElementGroup(tetrahedra(values), group, positions, time_step)
-    for stencils in getattr(values, "stencils", ()):
-        yield ElementGroup(stencils, np.arange(len(stencils.corners)), positions, time_step)
+    for stencils in values.stencils:
+        yield ElementGroup(stencils, np.arange(len(stencils)), positions, time_step)

@@ -278,7 +278,7 @@ def joined_components(values: SceneValues) -> Mask:
     Its energy would change with a rigid motion of the component.
     """
     joined = np.zeros(int(values.component.max()) + 1, dtype=np.bool_)
-    for stencils in getattr(values, "stencils", ()):
+    for stencils in values.stencils:
         components = values.component[stencils.corners]
         joined[components[(components != components[:, :1]).any(axis=1)]] = True
     return joined

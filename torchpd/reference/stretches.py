@@ -116,7 +116,7 @@ class Limit(Stretches):
         return super().products(F, dF) | self._passed(change, values)
 
 
-def nearest_unit_volume(stretches: Array, *, samples: int = 96, sweeps: int = 60) -> Array:
+def nearest_unit_volume(stretches: Array, *, samples: int = 48, sweeps: int = 55) -> Array:
     """The nearest z [N, 3] > 0 with z_1 z_2 z_3 = 1 of signed stretches s_1 >= s_2 >= |s_3|.
 
     A stationary point has z_i - s_i + m / z_i = 0; in the nearest one only z_3 = t may be the smaller of the two roots.

@@ -57,7 +57,7 @@ class RigidPieces:
             and the highest, which must differ by a factor of 100.
 
     Raises:
-        ValueError: contacts in the scene, no free piece, more than 256 pieces, or too little memory.
+        ValueError: contacts or other bodies than solids in the scene, no free piece, more than 256 pieces, or too little memory.
     """
 
     def __init__(self, sim: Stepper, *, stiffer_than: float | None = None) -> None:
@@ -66,6 +66,10 @@ class RigidPieces:
         if sim.planes.shape[-2] or sim.spheres.shape[-2]:
             raise ValueError(
                 "RigidPieces: the scene must have no contacts, which rigid motions do not model; use sim alone"
+            )
+        if sim.scene.values().stencils:
+            raise ValueError(
+                "RigidPieces: the scene must consist of solids alone, whose tetrahedra make the pieces; use sim alone"
             )
         self.sim = sim
         self.stiffer_than = (

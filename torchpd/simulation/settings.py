@@ -18,7 +18,7 @@ from ..estimate.solver_choice import Choice, choose_solver, warn_of_few_iteratio
 from ..plan.compiled import CompiledScene
 from ..plan.kernel_choice import check_kernel
 from ..plan.placement import is_suitable, move_plan, plan_for_device, plan_for_solver, recompile_plan
-from ..scene.solvers import Chebyshev, Solver, check_solver
+from ..scene.solvers import Chebyshev, Multilevel, Solver, check_solver
 from .state_checks import check_adjoint, check_batch
 
 __all__ = [
@@ -128,6 +128,11 @@ def _planned_anew(now: Configuration) -> Configuration:
 
 
 def _solved_by(now: Configuration, solver: Solver) -> Configuration:
+    if isinstance(solver, Multilevel) and solver.outer == "corotated" and now.has_stencils:
+        raise ValueError(
+            'Simulator: solver must not be Multilevel("corotated"), the default of Multilevel, for a scene with cloth, '
+            'rods, springs, ties or fibres: its coarse correction knows tetrahedra alone. Give Multilevel("lbfgs")'
+        )
     # the same number of iterations means another error for another solver
     checked = EVERY_STEP if now.named_iterations else NO_STEP
     now = replace(now, solver=solver, choice=None, checked_time_steps=checked)

@@ -32,6 +32,7 @@ class ElementCase:
     material: dict[str, float | tuple[float, ...]]
     energy: float
     stress: dict[tuple[int, int], float] = field(default_factory=dict)
+    constants: tuple[float, ...] = ()
     start: Array | None = None  # [n, 3] positions at the start of the step
     time_step: float = 1.0
 
@@ -44,7 +45,7 @@ class ElementCase:
             corners=corners,
             gradients=self.gradients[None],
             measure=np.ones(1),
-            constants=np.zeros((1, 0)),
+            constants=np.array([self.constants], np.float64).reshape(1, -1),
             material=rows,
         )
 
@@ -114,13 +115,30 @@ def _dilation(e: float, nu: float) -> ElementCase:
     return _at(f"dilation {e} {nu}", "tet", (1.0 + e) * np.eye(3), material, 1.5 * shear * e**2 + volume, stress)
 
 
+def _line(kind: str, length: float, rest: float, material: dict[str, float], *constants: float) -> ElementCase:
+    """An element of stiffness 3 with F of this length along (2, -1, 2): E = 3 / 2 (|F| - L)^2."""
+    corners = {"spring": 2, "tie": 5, "hinge": 4, "fibre": 4, "thread": 3}[kind]
+    direction = np.array([2.0, -1.0, 2.0]) / 3.0
+    gradients = np.array([[-1.0], [0.6], [0.4], [0.1], [-0.1]])[:corners]
+    gradients[-1] -= gradients.sum()
+    # corners beyond the second lie on the first
+    positions = np.zeros((corners, 3))
+    positions[1] = length * direction / gradients[1, 0]
+    slack = length < rest and constants == (1.0,)
+    pull = 0.0 if slack else 3.0 * (length - rest)
+    stress = {(i, 0): pull * component for i, component in enumerate(direction)}
+    name = " ".join([kind, str(length), *map(str, constants)])
+    given: dict[str, float | tuple[float, ...]] = {**material}
+    return ElementCase(name, kind, gradients, positions, given, pull**2 / 6.0, stress, constants)
+
+
 def _damped() -> ElementCase:
     """The part of damping: 2 mu = 1 and beta / h = b = 0.5 give 0.5 (1.07 - 1.02); elasticity adds 0.07."""
     gradients, start = unit_gradients(3), unit_positions(np.diag([1.02, 1.0, 1.0]))
     positions = unit_positions(np.diag([1.07, 1.0, 1.0]))
     stress = _full(np.diag([0.025, 0.0, 0.0]).tolist())
     material: dict[str, float | tuple[float, ...]] = {"viscosity": 0.05}
-    return ElementCase("damped", "damper", gradients, positions, material, 0.25 * 0.05**2, stress, start, 0.1)
+    return ElementCase("damped", "damper", gradients, positions, material, 0.25 * 0.05**2, stress, (), start, 0.1)
 
 
 ELEMENT_CASES = (
@@ -147,6 +165,13 @@ ELEMENT_CASES = (
     _at("cloth limit", "cloth_limit", _SHEET, {"cloth_limit": (0.95, 1.05, 1.0)}, 0.0257453805182, {}),
     _fold(90.0, 2.0),
     _fold(60.0, 1.0),
+    _line("spring", 0.7, 0.5, {"spring_stiffness": 3.0, "rest_length": 0.5}),
+    _line("tie", 0.7, 0.0, {"tie_stiffness": 3.0}),
+    _line("hinge", 0.7, 2.0, {"bending": 3.0, "rest_curvature": 2.0}),
+    _line("fibre", 0.9, 0.8, {"fibre_stiffness": 3.0, "fibre_length": 0.8}, 1.0),
+    _line("fibre", 0.7, 0.8, {"fibre_stiffness": 3.0, "fibre_length": 0.8}, 1.0),
+    _line("fibre", 0.7, 0.8, {"fibre_stiffness": 3.0, "fibre_length": 0.8}, 0.0),
+    _line("thread", 0.7, 1.0, {"thread_stiffness": 3.0}),
     _damped(),
 )  # fmt: skip
 

@@ -6,7 +6,7 @@ Places are means of vertices [m], to 1e-6; energies are those of the converged s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 from cases import beam, beam_tip, box
@@ -21,15 +21,6 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Point = tuple[float, float, float]
 GRAVITY = np.array([0.0, -9.8, 0.0])
-
-
-@dataclass(frozen=True)
-class StencilValues(SceneValues):
-    """Flat arrays of a scene with elements of other kinds."""
-
-    stencils: tuple[StencilGroup, ...] = ()
-    poisson: Array | None = None
-    tet_group: Index | None = None
 
 
 @dataclass(frozen=True)
@@ -50,12 +41,6 @@ class StencilScene:
         return step_problem(self.values, at, self.velocities, self.time_step, pin_targets=self.pin_targets)
 
 
-def with_stencils(values: SceneValues, **more: object) -> StencilValues:
-    """The same scene with `stencils`, `poisson` or `tet_group`, or with other arrays."""
-    given = {row.name: getattr(values, row.name) for row in fields(values)}
-    return StencilValues(**(given | more))
-
-
 def bare_values(
     positions: Array,
     masses: Array,
@@ -64,11 +49,11 @@ def bare_values(
     *,
     gravity: Array = GRAVITY,
     component: Index | None = None,
-) -> StencilValues:
+) -> SceneValues:
     """A scene without tetrahedra, all vertices in one component by default, some of them held."""
     parts = np.zeros(len(positions), dtype=np.int64) if component is None else component
     pinned = PinnedComponents.of(positions, masses, parts, held)
-    return StencilValues(
+    return SceneValues(
         rest_positions=positions,
         tets=np.zeros((0, 4), dtype=np.int64),
         stiffness=np.zeros(0),
@@ -250,7 +235,7 @@ class SolidCase:
         values = case.scene.values()
         count = len(values.tets)
         share = np.arange(count) // 6 if self.cells else None
-        mixed = with_stencils(values, poisson=np.full(count, self.poisson), tet_group=share)
+        mixed = replace(values, poisson=np.full(count, self.poisson), tet_group=share)
         return StencilScene(mixed, case.velocities, case.time_step, self.energy, ((beam_tip(), self.tip),))
 
 
@@ -277,7 +262,7 @@ def limited_beam(stiffness: float, tip: Point, energy: float) -> StencilScene:
     velocities = case.velocities + case.positions * [3.0, 0.0, 0.0]
     rows = np.array([[0.95, 1.05, stiffness]])
     limit = of_tets("solid_limit", values, np.arange(len(values.tets)), solid_limit=rows)
-    mixed = with_stencils(values, stencils=(limit,))
+    mixed = replace(values, stencils=(limit,))
     return StencilScene(mixed, velocities, case.time_step, energy, ((beam_tip(), tip),), start="velocity")
 
 
@@ -298,7 +283,7 @@ def muscle_beam(*, upper: bool, tip: Point, energy: float) -> StencilScene:
     slack = np.zeros((len(chosen), 1))
     along = shape.shape_gradients[:, :, :1]
     fibres = group("fibre", values.tets[chosen], along, shape.volumes, constants=slack, **rows)
-    mixed = with_stencils(values, stencils=(fibres,))
+    mixed = replace(values, stencils=(fibres,))
     still = np.zeros_like(case.velocities)
     return StencilScene(mixed, still, case.time_step, energy, ((beam_tip(), tip),), start="velocity")
 
@@ -320,7 +305,7 @@ def _bar(density: float) -> tuple[Array, Index, Array, Index]:
 def capped_box() -> StencilScene:
     """A box of nu = .45 drawn to 1.6 of its length, its end scaled by 1.3: a tenth of the tetrahedra are capped."""
     positions, tets, masses, held = _bar(1000.0)
-    values = with_stencils(
+    values = replace(
         bare_values(positions, masses, (), held),
         tets=tets,
         stiffness=np.full(len(tets), 1e5),
@@ -342,7 +327,7 @@ def capped_box() -> StencilScene:
 def small_beam(youngs: float, poisson: float) -> StencilScene:
     """The swinging beam with 10x2x2 cells."""
     positions, tets, masses, ends = _bar(1000.0)
-    values = with_stencils(
+    values = replace(
         bare_values(positions, masses, (), ends[: len(ends) // 2]),
         tets=tets,
         stiffness=np.full(len(tets), youngs),
