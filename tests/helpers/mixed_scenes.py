@@ -25,7 +25,7 @@ def _block(cells: tuple[int, int, int] = (3, 2, 2)) -> pd.Solid:
 def sheet_case(cells: tuple[int, int] = (6, 5)) -> Case:
     """Cloth held at an edge: triangles, hinges with a curvature at rest, threads."""
     mesh = surface(size=(0.6, 0.5), cells=cells)
-    body = cloth(mesh, bending=1e-4, rest_curvature=0.5, warp=200.0, weft=50.0)
+    body = cloth(mesh, bending=1e-4, rest_curvature=0.5, warp=200.0, weft=50.0, grain=(1.0, 0.0, 0.3))
     return _case(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity((1.0, -9.8, 0.5)), pd.Damping(1.0))
 
 
@@ -65,14 +65,14 @@ def mixed_case(*parts: object) -> Case:
     """Solid, cloth tied to it, a rod, springs and fibres, with contacts."""
     solid = _block()
     mesh = surface(size=(0.4, 0.3), cells=(5, 4)).translated((0.05, 0.2, 0.0))
-    sheet = cloth(mesh, bending=1e-4, poisson=0.2, weft=100.0)
+    sheet = cloth(mesh, bending=1e-4, poisson=0.2, weft=100.0, grain=(1.0, 0.0, 0.0))
     points = np.stack([np.linspace(0.0, 0.5, 9), np.full(9, 0.4), np.full(9, 0.1)], axis=1)
     rod = pd.Rod(points, 1e7, 0.004)
     return _case(
         solid, sheet, rod,
         pd.Fibres(solid, (1.0, 0.0, 0.0), 1e5, activation=0.5),
         pd.Tie(sheet, [0, 5, 11], solid, stiffness=2e3),
-        pd.Tie(rod, [4], sheet, stiffness=500.0),
+        pd.Tie(rod, [4], sheet, [[0.25, 0.2, 0.1]], stiffness=500.0),
         pd.Springs(rod, [[0, 3], [8, 20]], 100.0, other=sheet),
         pd.Pin(rod, [0]), pd.Gravity(), pd.Ground(0.001, friction=0.4), pd.Sphere((0.2, -0.05, 0.1), 0.06, 0.3), *parts,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cases import Case
-from device_plans import BLOCK, CLUSTER, GRID, LANES, NONE, STREAM, Arrays, Lanes, rows_of, slices_of
+from device_plans import BLOCK, CLUSTER, GRID, LANES, NONE, SIZES, STREAM, Arrays, Lanes, rows_of, slices_of
 from mixed_scenes import CASES, mixed_case, sheet_case
 from numpy.typing import NDArray
 
@@ -122,8 +122,7 @@ def test_every_entry_has_one_writer_and_every_corner_one_entry(built: tuple[Case
     assert ((entry - first[row]) // 8 < forces[row]).all()
     np.testing.assert_array_equal(np.bincount(row, minlength=len(forces)), forces)
     ends = [start[-1] + 8 * rows[-1] for start, rows in slices_of(plan)]
-    assert plan.sizes[[row.name for row in DEVICE_PLAN_TABLE].index("sizes")] == plan.sizes[0]
-    assert plan.sizes[13] == max(ends)
+    assert plan.sizes[SIZES.index("most_entries")] == max(ends)
 
 
 def test_blocks_of_a_patch_stand_kind_by_kind(built: tuple[Case, Arrays]) -> None:
@@ -138,16 +137,13 @@ def test_blocks_of_a_patch_stand_kind_by_kind(built: tuple[Case, Arrays]) -> Non
         np.testing.assert_array_equal(plan.stencil_block[:, column], np.cumsum(rows) - rows)
 
 
-def test_tetrahedra_keep_their_plan() -> None:
-    """Where no stencil touches them, in one patch: pairs, their order and their entries."""
-    block = pd.Solid(pd.shapes.box((0.3, 0.2, 0.2), (3, 2, 2)), 1e5)
-    alone = compile_device_plan(pd.Scene(block).values(), 1, BLOCK, torch.float32)
-    rod = pd.Rod([[1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [1.0, 2.0, 0.0]], 1e6, 0.01)
-    mixed = arrays_of(Case(pd.Scene(block, rod), np.zeros(0), np.zeros(0), 0.01), 1, BLOCK, torch.float32)
-    assert len(alone) == len(DEVICE_PLAN_TABLE)
-    plain = {row.name: t.numpy() for row, t in zip(DEVICE_PLAN_TABLE, alone, strict=True)}
-    for name in ("pair_rest", "pair_bound", "pair_tet"):
-        assert sorted(map(tuple, plain[name].reshape(-1, 64))) == sorted(map(tuple, getattr(mixed, name).reshape(-1, 64)))
+@pytest.mark.parametrize(("kernel", "patches"), PLANS)
+def test_tetrahedra_are_there_beside_stencils(kernel: int, patches: int) -> None:
+    case = mixed_case()
+    lanes = Lanes.of(arrays_of(case, patches, kernel))
+    tets = case.scene.values().tets
+    assert sorted(lanes.tet[lanes.real]) == list(range(len(tets)))
+    assert (np.sort(lanes.tet_vertices[lanes.real]) == np.sort(tets[lanes.tet[lanes.real]])).all()
 
 
 def test_widths_and_types_follow_the_table() -> None:
