@@ -196,7 +196,7 @@ def has_friction(compiled: CompiledScene) -> bool:
 
 
 def held_up_by(compiled: CompiledScene) -> str:
-    """Obstacle to the convergence of `Multilevel`: cloth and the like, friction, a ball (sheets buckle over it), or ""."""
+    """Obstacle to the convergence of `Multilevel`: other parts than solids, friction, a ball (sheets buckle), or ""."""
     if compiled.has_stencils:
         return "a part besides solids"
     if has_friction(compiled):

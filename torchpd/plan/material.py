@@ -124,7 +124,7 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
     elif name in _NOT_NEGATIVE:
         _require(tensor >= 0, full, ">= 0", tensor)
     elif name == "membrane_poisson":
-        _require((tensor > -1) & (tensor <= 0.5), full, "in (-1, 0.5]", tensor)
+        _require((tensor > -1) & (tensor < 1), full, "in (-1, 1)", tensor)
     elif name == "poisson":
         _require((tensor > -1) & (tensor < 0.495), full, "in (-1, 0.495)", tensor)
     elif name == "damping":

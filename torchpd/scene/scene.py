@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,7 +44,7 @@ class SceneValues:
     planes: Array  # [C, 5] unit normal, height, friction
     spheres: Array  # [S, 5] center, radius, friction
     damping: float  # 1/s
-    component: Index  # [V] number of the connected component of each vertex
+    component: Index  # [V] number of the connected component of each vertex; springs and ties join those of bodies
     pinned: PinnedComponents  # pinned points of the components
     loose: NDArray[np.bool_]  # [components] whether hard pins leave a component rigid motions
     stencils: tuple[StencilGroup, ...] = ()  # at most one group per kind, in the order of `stencils.KINDS`
@@ -54,6 +55,19 @@ class SceneValues:
 def _no_part(part: object) -> TypeError:
     fix = "; pass them one by one, Scene(*parts)" if isinstance(part, (list, tuple)) else ""
     return TypeError(f"Scene: parts are bodies and effects of torchpd, got {type(part).__name__}{fix}")
+
+
+def _joined(component: Index, stencils: Iterable[StencilGroup]) -> Index:
+    """Components that springs and ties join count as one: only their common rigid motions change no elastic energy."""
+    ends = [np.stack(np.broadcast_arrays(of[:, :1], of[:, 1:]), axis=-1).reshape(-1, 2) for of in (
+        component[group.corners] for group in stencils
+    )]  # fmt: skip
+    pairs = np.concatenate([np.stack([component, component], axis=1), *ends])
+    if not (pairs[:, 0] != pairs[:, 1]).any():
+        return component
+    whole = mesh_components(pairs)[component]
+    _, first, number = np.unique(whole, return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[number], dtype=np.int64)
 
 
 class Scene:
@@ -172,7 +186,9 @@ class Scene:
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
-        masses, component = np.concatenate([body.masses() for body in self.bodies]), self._components()
+        stencils = merge_groups(group for part in self.parts for group in part.stencils(lambda body: starts[id(body)]))
+        masses = np.concatenate([body.masses() for body in self.bodies])
+        component = _joined(self._components(), stencils)
         pinned = PinnedComponents.of(positions, masses, component, pin_vertices)
         gravity, damping = self._all(Gravity), self._all(Damping)
         none = np.zeros(0)
@@ -193,15 +209,13 @@ class Scene:
             component=component,
             pinned=pinned,
             loose=pinned.loose(np.isinf(stiffness)),
-            stencils=merge_groups(
-                group for part in self.parts for group in part.stencils(lambda body: starts[id(body)])
-            ),
+            stencils=stencils,
             poisson=poisson,
             tet_group=tet_group,
         )
 
     def _components(self) -> Index:
-        """Number of the connected component of each vertex [V]; springs and ties join none."""
+        """Number of the connected component of each vertex within its body [V]."""
         parts, count = [], 0
         for body in self.bodies:
             parts.append(mesh_components(body.elements) + count)

@@ -57,7 +57,8 @@ class RigidPieces:
             and the highest, which must differ by a factor of 100.
 
     Raises:
-        ValueError: contacts or other bodies than solids in the scene, no free piece, more than 256 pieces, or too little memory.
+        ValueError: contacts, or other parts than solids, in the scene; no free piece, more than 256 pieces, or too
+            little memory.
     """
 
     def __init__(self, sim: Stepper, *, stiffer_than: float | None = None) -> None:

@@ -22,9 +22,13 @@ Vector gradient_of(const StencilGroup& group, std::int64_t s, int a) {
 
 Vector unit(const Vector& a) { return (1 / std::sqrt(dot(a, a))) * a; }
 
-// `a` without its parts along orthonormal axes, the last of which are known
-Vector off_axes(Vector a, const std::array<Vector, 3>& axes, int known_from, int dims) {
-  for (int k = known_from; k < dims; ++k) a = a - dot(axes[k], a) * axes[k];
+// The direction of `a` without its parts along orthonormal axes, the last of which are known. The second round removes
+// what the first leaves where `a` is almost along them.
+Vector axis_along(Vector a, const std::array<Vector, 3>& axes, int known_from, int dims) {
+  for (int round = 0; round < 2; ++round) {
+    for (int k = known_from; k < dims; ++k) a = a - dot(axes[k], a) * axes[k];
+    a = unit(a);
+  }
   return a;
 }
 
@@ -44,7 +48,7 @@ std::vector<double> stored_gradients(const StencilGroup& group, std::int64_t s) 
   // Axis d - 1 along the last vector, axis d - 2 in the plane of the last two, and so on: Gram and Schmidt backwards.
   std::array<Vector, 3> axes = {};
   for (int j = d - 1; j >= 0; --j)
-    axes[j] = unit(off_axes(gradient_of(group, s, n - d + j), axes, j + 1, d));
+    axes[j] = axis_along(gradient_of(group, s, n - d + j), axes, j + 1, d);
   // a rotation, not a mirror, which would turn an inverted element around
   if (d == 3 && dot(cross(axes[0], axes[1]), axes[2]) < 0) axes[0] = -axes[0];
   std::vector<double> numbers;
