@@ -1,6 +1,7 @@
 // Stencils of a patch in a thread block, beside its pairs of tetrahedra: a warp takes a block of 32 stencils of one kind.
 // Corners write their forces to entries of their own, like those of pairs (cuda/elements/pairs_per_thread.h).
 #pragma once
+#include "cuda/common/reductions.h"
 #include "cuda/elements/pairs_per_thread.h"
 #include "elements/kinds.h"
 
@@ -31,9 +32,14 @@ struct StencilPlace {
   int number;  // of the block
 
   PD_DEVICE StencilPlace(const DeviceStencils<T>& stencils, int block_number)
-      : plan(stencils),
-        block(reinterpret_cast<const StencilBlock*>(stencils.stencil_block)[block_number]),
-        number(block_number) {}
+      : StencilPlace(stencils, block_of(stencils, block_number), block_number) {}
+  PD_DEVICE StencilPlace(const DeviceStencils<T>& stencils, const StencilBlock& loaded,
+                         int block_number)
+      : plan(stencils), block(loaded), number(block_number) {}
+
+  PD_DEVICE static StencilBlock block_of(const DeviceStencils<T>& stencils, int block_number) {
+    return reinterpret_cast<const StencilBlock*>(stencils.stencil_block)[block_number];
+  }
 
   PD_DEVICE std::size_t row(int first, int which) const {
     return std::size_t(first + which) * stencil_lanes + threadIdx.x % stencil_lanes;
@@ -91,11 +97,35 @@ PD_DEVICE void each_stencil_block(const DeviceStencils<T>& plan, int patch, int 
   int turn = warp - before % warps;
   if (turn < 0) turn += warps;
   const int end = plan.patch_stencil[patch + 1];
+  int number = plan.patch_stencil[patch] + turn;
+  if (number >= end) return;
+  StencilBlock now = StencilPlace<T>::block_of(plan, number);
 #pragma unroll 1
-  for (int number = plan.patch_stencil[patch] + turn; number < end; number += warps) {
-    const StencilPlace<T> place(plan, number);
+  for (; number < end; number += warps) {
+    // in flight while this warp works on the present one
+    const StencilBlock next = StencilPlace<T>::block_of(plan, min(number + warps, end - 1));
+    const StencilPlace<T> place(plan, now, number);
     with_kind(place.block.kind, [&](auto kind) { visit(kind, place); });
+    now = next;
   }
+}
+
+// Prefetches what the blocks of a patch read, but for that of the last one, into the L2 cache.
+template <class T>
+PD_DEVICE void prefetch_stencils(const StencilWork<T>& work, std::int64_t environment, int patch) {
+  const DeviceStencils<T>& plan = work.plan;
+  const int first = plan.patch_stencil[patch], last = plan.patch_stencil[patch + 1] - 1;
+  if (first >= last) return;
+  const StencilBlock from = StencilPlace<T>::block_of(plan, first);
+  const StencilBlock to = StencilPlace<T>::block_of(plan, last);
+  const auto prefetch = [](const auto* rows, int begin, int end, int warp) {
+    bulk_prefetch_to_l2(rows + std::size_t(begin) * stencil_lanes, (end - begin) * stencil_lanes,
+                        (int(threadIdx.x) + int(blockDim.x) - warp * warp_size) % int(blockDim.x),
+                        int(blockDim.x));
+  };
+  prefetch(plan.stencil_corner, from.corner, to.corner, 0);
+  prefetch(plan.stencil_stored, from.stored, to.stored, 1);
+  prefetch(work.numbers_of(environment), from.number, to.number, 2);
 }
 
 // Applies an operation to the stencils of a patch; returns this thread's energy sum.

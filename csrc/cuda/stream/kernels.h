@@ -281,6 +281,7 @@ PD_DEVICE void update_patch(const StreamCall<T>& call, int k, std::byte* shared,
   const int number = int(blockIdx.x % call.step.plan.patches);
   const StreamWork<T, HasContacts> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
+  if constexpr (Stencils::any) prefetch_stencils(stencils.work, w.environment, number);
   // prefetches data that is read after the elements
   const Patch<T> patch(w.plan, number);
   if constexpr (What != Visit::diagonal) {
