@@ -13,7 +13,7 @@ struct FrictionVectors {
 };
 
 // One environment, with its fields in shared memory. A thread keeps its vertices in all loops.
-// `Work`: as for solve_in_block.
+// `Work`: as for conjugate_block.
 template <class Work>
 class FrictionBlock {
   using T = typename Work::real;

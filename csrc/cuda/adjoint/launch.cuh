@@ -23,9 +23,11 @@ __device__ ConjugateMemory<T> memory_of_team(const ConjugateTeams<T>& work, int 
 }
 
 // `WithFriction`: adds the solve with friction. `Work`: ConjugateTeams, or one that adds to it.
-template <bool WithLevels, bool Computed, bool WithFriction, class Work>
-PD_DEVICE void solve_in_teams(const Work& work, std::byte* shared) {
+template <class Work, bool WithLevels, bool Computed, bool WithFriction>
+__global__ void __launch_bounds__(conjugate_threads<typename Work::real>)
+    conjugate_teams(const __grid_constant__ Work work) {
   using T = typename Work::real;
+  extern __shared__ __align__(16) std::byte shared[];
   __shared__ WarpSums warp_sums;
   __shared__ Quad<T> cycle_sums[WithLevels ? 4 * conjugate_threads<T> / warp_size : 1];
   const int number = int(blockIdx.x) / work.blocks;
@@ -41,13 +43,6 @@ PD_DEVICE void solve_in_teams(const Work& work, std::byte* shared) {
     }
     Team(work, memory, e, team, shared, warp_sums, cycle_sums).run();
   }
-}
-
-template <class T, bool WithLevels, bool Computed, bool WithFriction>
-__global__ void __launch_bounds__(conjugate_threads<T>)
-    conjugate_teams(const __grid_constant__ ConjugateTeams<T> work) {
-  extern __shared__ __align__(16) std::byte shared[];
-  solve_in_teams<WithLevels, Computed, WithFriction>(work, shared);
 }
 
 template <class T>
@@ -91,7 +86,7 @@ struct ConjugateLaunch {
   }
   template <bool WithLevels, bool Computed, bool WithFriction>
   static const void* function() {
-    return reinterpret_cast<const void*>(conjugate_teams<T, WithLevels, Computed, WithFriction>);
+    return reinterpret_cast<const void*>(conjugate_teams<ConjugateTeams<T>, WithLevels, Computed, WithFriction>);
   }
   int resident() const {
     const int blocks = resident_blocks(kernel, threads, shared);

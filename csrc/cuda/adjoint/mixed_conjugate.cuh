@@ -11,18 +11,11 @@ struct MixedConjugateBlock : ConjugateBlock<T> {
 };
 
 template <class T>
-__device__ void multiply_elements(const MixedConjugateBlock<T>& work,
+PD_DEVICE void multiply_elements(const MixedConjugateBlock<T>& work,
                                   const PatchFields<2, T>& fields) {
   each_pair_and_stencil<2>(fields.patch, fields, rest_of<false>(fields.patch),
-                           work.product.weights_of(fields.environment), work.stencils,
-                           fields.environment, false, fields.entries, SolidHessian{});
-}
-
-template <class T, bool WithFriction>
-__global__ void __launch_bounds__(conjugate_threads<T>)
-    mixed_conjugate_block(const __grid_constant__ MixedConjugateBlock<T> work) {
-  extern __shared__ __align__(16) std::byte shared[];
-  solve_in_block<WithFriction>(work, shared);
+                           work.product.weights_of(blockIdx.x), work.stencils,
+                           blockIdx.x, false, fields.entries, SolidHessian{});
 }
 
 template <class T>
@@ -30,13 +23,6 @@ struct MixedConjugateTeams : ConjugateTeams<T> {
   static constexpr bool has_stencils = true;
   StencilWork<T> stencils;
 };
-
-template <class T, bool WithFriction>
-__global__ void __launch_bounds__(conjugate_threads<T>)
-    mixed_conjugate_teams(const __grid_constant__ MixedConjugateTeams<T> work) {
-  extern __shared__ __align__(16) std::byte shared[];
-  solve_in_teams<false, true, WithFriction>(work, shared);
-}
 
 // Pairs and stencils of a patch, about: a warp takes 32 of either at a time.
 template <class T>
@@ -48,8 +34,9 @@ int items_of_patch(const MixedConjugate<T>& call) {
 
 template <class T>
 ConjugateLaunch<T> mixed_launch(const MixedConjugate<T>& call) {
-  const auto kernel =
-      call.friction ? mixed_conjugate_teams<T, true> : mixed_conjugate_teams<T, false>;
+  using Work = MixedConjugateTeams<T>;
+  const auto kernel = call.friction ? conjugate_teams<Work, false, true, true>
+                                    : conjugate_teams<Work, false, true, false>;
   return {call, reinterpret_cast<const void*>(kernel), items_of_patch(call)};
 }
 
@@ -82,9 +69,7 @@ void run_mixed_conjugate(const MixedConjugate<T>& call, void* memory, Stream to)
     work.stencils = arrange_stencils(arena, call);
     compute_stencil_numbers(work.stencils, call.effects, call.batch, stream);
     compute_field_weights<false, T>(work.product, stream);
-    launch_block(
-        call.friction ? mixed_conjugate_block<T, true> : mixed_conjugate_block<T, false>, work,
-        items_of_patch(call), stream);
+    launch_block(work, items_of_patch(call), stream);
     return;
   }
   const ConjugateLaunch<T> launch = mixed_launch(call);

@@ -20,17 +20,19 @@ struct ConjugateBlock {
 
 // Writes the elastic product of an environment's direction to the entries.
 template <class T>
-__device__ void multiply_elements(const ConjugateBlock<T>& work, const PatchFields<2, T>& fields) {
+PD_DEVICE void multiply_elements(const ConjugateBlock<T>& work, const PatchFields<2, T>& fields) {
   each_pair<2>(fields.patch, fields, rest_of<false>(fields.patch),
-               work.product.weights_of(fields.environment), fields.entries, SolidHessian{});
+               work.product.weights_of(blockIdx.x), fields.entries, SolidHessian{});
 }
 
 // All iterations of one environment, independent of the others and without host synchronisation. A
 // thread keeps its vertices in all loops, so it reads its own writes to global memory.
 // `WithFriction`: adds the solve with friction. `Work`: ConjugateBlock, or one that adds to it.
-template <bool WithFriction, class Work>
-PD_DEVICE void solve_in_block(const Work& work, std::byte* shared) {
+template <class Work, bool WithFriction>
+__global__ void __launch_bounds__(conjugate_threads<typename Work::real>)
+    conjugate_block(const __grid_constant__ Work work) {
   using T = typename Work::real;
+  extern __shared__ __align__(16) std::byte shared[];
   __shared__ WarpSums warp_sums;
   const DeviceConjugate<T>& call = work.call;
   const DevicePlan<T>& plan = call.plan;
@@ -140,13 +142,6 @@ PD_DEVICE void solve_in_block(const Work& work, std::byte* shared) {
   if (threadIdx.x == 0) numbers.write(progress);
 }
 
-template <class T, bool WithFriction>
-__global__ void __launch_bounds__(conjugate_threads<T>)
-    conjugate_block(const __grid_constant__ ConjugateBlock<T> work) {
-  extern __shared__ __align__(16) std::byte shared[];
-  solve_in_block<WithFriction>(work, shared);
-}
-
 template <class T>
 ConjugateBlock<T> arrange_block(Arena& arena, const DeviceConjugate<T>& call) {
   ConjugateBlock<T> work{call, arrange(arena, conjugate_field(call), 0), nullptr, {}};
@@ -160,8 +155,10 @@ ConjugateBlock<T> arrange_block(Arena& arena, const DeviceConjugate<T>& call) {
 
 // `pairs`: of tetrahedra, or items that threads take like them
 template <class Work>
-void launch_block(void (*kernel)(Work), const Work& work, int pairs, cudaStream_t stream) {
+void launch_block(const Work& work, int pairs, cudaStream_t stream) {
   using T = typename Work::real;
+  const auto kernel =
+      work.call.friction ? conjugate_block<Work, true> : conjugate_block<Work, false>;
   const DevicePlan<T>& plan = work.call.plan;
   const std::size_t bytes = pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
   // Half as many threads if two blocks then share a multiprocessor, unless the plan is for one
@@ -182,8 +179,7 @@ void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStrea
   Arena arena(memory);
   const ConjugateBlock<T> work = arrange_block(arena, call);
   compute_field_weights<false>(work.product, stream);
-  launch_block(call.friction ? conjugate_block<T, true> : conjugate_block<T, false>, work,
-               call.plan.most_pairs, stream);
+  launch_block(work, call.plan.most_pairs, stream);
 }
 
 }  // namespace pd
