@@ -65,7 +65,9 @@ def stream_bytes(plan: Plan, batch: int) -> int:
 
 
 @torch.no_grad()
-def measure_cloth(name: str, dtype: torch.dtype, device: torch.device, repetitions: int, seconds: float) -> dict[str, Any]:
+def measure_cloth(
+    name: str, dtype: torch.dtype, device: torch.device, repetitions: int, seconds: float
+) -> dict[str, Any]:
     """A row: sizes, microseconds of an iteration and the share of the bandwidth."""
     scene = CLOTH_SCENES[name]
     mesh = sheet(scene.cells)

@@ -217,9 +217,8 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets,
     throw py::value_error("kernel must be 0, 1, 2 or 3, got " + std::to_string(kernel));
   if (!stencils.empty() && kernel != int(pd::DeviceKernel::block) &&
       kernel != int(pd::DeviceKernel::stream))
-    throw py::value_error(
-        "kernel must be 0 (block) or 3 (stream) for a scene with stencils, got " +
-        std::to_string(kernel));
+    throw py::value_error("kernel must be 0 (block) or 3 (stream) for a scene with stencils, got " +
+                          std::to_string(kernel));
   const std::int64_t vertices = positions.shape(0);
   if (kernel == int(pd::DeviceKernel::cluster)) check_cluster(vertices, tets, patches);
   if (piece.ndim() != 1 || piece.shape(0) != vertices)
@@ -382,8 +381,7 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes,
   const bool levels = level_sizes.size() > 0, stencils = stencil_sizes.size() > 0;
   if (sizes.size() != pd::size_count || (levels && level_sizes.size() != pd::level_size_count) ||
       (stencils && stencil_sizes.size() < pd::stencil_size_count))
-    throw py::value_error(
-        "sizes, level_sizes and stencil_sizes must be those of a plan for a GPU");
+    throw py::value_error("sizes, level_sizes and stencil_sizes must be those of a plan for a GPU");
   pd::MixedStep<T> step;
   step.plan = pd::count_device_plan<T>(sizes.data());
   if (levels) step.plan.levels = pd::count_levels<T>(level_sizes.data(), step.plan.vertices);

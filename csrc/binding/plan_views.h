@@ -441,8 +441,7 @@ inline void check_effects(const int32* counts, at::TensorList material) {
   TORCH_CHECK_VALUE(material.size() == all_material_arrays, "material must be ",
                     all_material_arrays, " arrays for a plan with stencils, got ", material.size());
 #define KIND(kind, type, what)
-#define PARAMETER(kind, array) \
-  check_effect(material, #array, #kind, counts[int(KindNumber::kind)]);
+#define PARAMETER(kind, array) check_effect(material, #array, #kind, counts[int(KindNumber::kind)]);
 #include "elements/kinds.def"
 #undef KIND
 }

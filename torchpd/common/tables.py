@@ -27,7 +27,7 @@ __all__ = [
 
 
 class PlanRow(NamedTuple):
-    """A row of csrc/views/cpu_plan.def, cpu_stencils.def, multilevel.def, gpu_plan.def or gpu_stencils.def: a constant array."""
+    """A row of csrc/views/cpu_plan.def, gpu_plan.def, their stencils, or multilevel.def: a constant array."""
 
     name: str
     type: str

@@ -183,15 +183,6 @@ def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
     return replace(plan, arrays=arrays, loose=values.loose)
 
 
-def stencil_arrays(values: SceneValues) -> list[tuple[int, NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]]:
-    """Groups of stencils as the plans take them: number of the kind, corners, vectors g_a, measures, constants."""
-    kinds = list(KINDS)
-    return [
-        (kinds.index(group.kind), group.corners, group.gradients, group.measure, group.constants)
-        for group in values.stencils
-    ]
-
-
 def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
     """Counts of a CPU plan, in the order of PlanSize in csrc/views/views.h."""
     slots = np.diff(arrays["patch_slot"])

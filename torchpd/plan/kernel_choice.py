@@ -167,7 +167,7 @@ class _PlanBuilder(NamedTuple):
         return patches if patches <= wave else -(-patches // wave) * wave
 
     def uses_pipeline(self, gpu: Properties) -> bool:
-        """Whether "stream" runs as a pipeline with larger patches: float32, solids alone, no contacts, enough memory."""
+        """Whether "stream" runs as a pipeline: float32, solids alone, no contacts, enough shared memory."""
         others = len(self.values.planes) + len(self.values.spheres) + len(self.values.stencils) > 0
         return self.dtype == torch.float32 and not others and gpu.shared >= _PIPELINE_BYTES
 
@@ -312,8 +312,13 @@ def _plan_that_fits(scene: _PlanBuilder, gpu: Properties, name: str, more: Calla
         patches = min(more(patches), scene.elements)
 
 
-def _check_stencils(values: SceneValues, kernel: str, levels: bool) -> None:
-    """Refuse what scenes with stencils cannot have on a GPU."""
+def _check_effects(values: SceneValues, kernel: str, levels: bool) -> None:
+    """Refuse what no kernel computes."""
+    if values.poisson is not None:
+        raise ValueError(
+            "Simulator: Solid.poisson must be 0.0 for every solid on a GPU, got others; its kernels know no volume "
+            "strain: leave the simulator on the CPU"
+        )
     if not values.stencils:
         return
     if levels:
@@ -364,7 +369,7 @@ def choose_plan(
         fastest: for "benchmark": chooses among a plan for every kernel that fits, see `kernel_benchmark`.
     """
     check_kernel(kernel)
-    _check_stencils(values, kernel, levels)
+    _check_effects(values, kernel, levels)
     scene = _PlanBuilder(values, dtype, progress)
     size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
     if levels:

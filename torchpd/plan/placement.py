@@ -128,7 +128,7 @@ def is_suitable(compiled: CompiledScene) -> bool:
 
 def _with_preconditioner(compiled: CompiledScene, plan: Plan, reference: ReferenceMaterial) -> Plan:
     """Add a multilevel preconditioner to a plan. On a GPU only the stream kernel reads it, for solids alone."""
-    if plan.kernel is not None and compiled.scene.values().stencils:
+    if plan.kernel is not None and compiled.has_stencils:
         raise ValueError(
             f'Simulator: adjoint="multilevel" needs a scene of solids alone on a GPU, got {OTHER_BODIES} too; '
             'leave adjoint at "solver"'
@@ -210,7 +210,7 @@ def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.de
     real = torch.finfo(plan.dtype).bits // 8
     none = np.empty(0, dtype=np.int32)
     levels = plan.level_sizes.numpy() if has_preconditioner(plan.arrays) else none
-    stencils = plan.stencil_sizes.numpy() if compiled.scene.values().stencils else none
+    stencils = plan.stencil_sizes.numpy() if compiled.has_stencils else none
     planes, spheres = (compiled.named[name] for name in ("planes", "spheres"))
 
     def own(name: str) -> bool:

@@ -29,8 +29,7 @@ struct Cuda {
 
   template <class Call>
   static void view_stencils(Mixed<Call>& call, at::TensorList arrays, const Place& place) {
-    call.stencils =
-        device_stencils_view<typename Call::real>(arrays, call.plan.patches, place);
+    call.stencils = device_stencils_view<typename Call::real>(arrays, call.plan.patches, place);
   }
   template <class Call>
   static const int32* stencil_counts(const Mixed<Call>& call) {
@@ -41,7 +40,8 @@ struct Cuda {
   static void step(const Step<T>& call, const Tensor& like) {
     const bool stream = call.plan.kernel == int(DeviceKernel::stream);
     if (call.stencils.blocks > 0)
-      return run(like, call, mixed_step_bytes<T>, stream ? run_mixed_stream<T> : run_mixed_block<T>);
+      return run(like, call, mixed_step_bytes<T>,
+                 stream ? run_mixed_stream<T> : run_mixed_block<T>);
     run<DeviceStep<T>>(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
   }
 

@@ -8,7 +8,6 @@ namespace pd {
 template <class Work, bool WithLevels, bool Computed>
 class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
   using Base = ConjugateTeam<Work, WithLevels, Computed>;
-  using typename Base::T;
   using Base::call_;
   using Base::cycle_;
   using Base::direction_pending_;
@@ -23,6 +22,7 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
   using Base::team_;
   using Base::unit_;
   using Base::warp_sums_;
+  using typename Base::T;
 
  public:
   using Base::Base;

@@ -60,9 +60,9 @@ struct ConjugateLaunch {
   Teams teams;
 
   explicit ConjugateLaunch(const DeviceConjugate<T>& call)
-      : ConjugateLaunch(
-            call, call.friction ? kernel_for<true>(call.plan) : kernel_for<false>(call.plan),
-            call.plan.most_pairs) {}
+      : ConjugateLaunch(call,
+                        call.friction ? kernel_for<true>(call.plan) : kernel_for<false>(call.plan),
+                        call.plan.most_pairs) {}
 
   // `pairs`: of tetrahedra, or items that threads take like them
   ConjugateLaunch(const DeviceConjugate<T>& call, const void* function, int pairs)
@@ -86,7 +86,8 @@ struct ConjugateLaunch {
   }
   template <bool WithLevels, bool Computed, bool WithFriction>
   static const void* function() {
-    return reinterpret_cast<const void*>(conjugate_teams<ConjugateTeams<T>, WithLevels, Computed, WithFriction>);
+    return reinterpret_cast<const void*>(
+        conjugate_teams<ConjugateTeams<T>, WithLevels, Computed, WithFriction>);
   }
   int resident() const {
     const int blocks = resident_blocks(kernel, threads, shared);

@@ -12,10 +12,10 @@ struct MixedConjugateBlock : ConjugateBlock<T> {
 
 template <class T>
 PD_DEVICE void multiply_elements(const MixedConjugateBlock<T>& work,
-                                  const PatchFields<2, T>& fields) {
+                                 const PatchFields<2, T>& fields) {
   each_pair_and_stencil<2>(fields.patch, fields, rest_of<false>(fields.patch),
-                           work.product.weights_of(blockIdx.x), work.stencils,
-                           blockIdx.x, false, fields.entries, SolidHessian{});
+                           work.product.weights_of(blockIdx.x), work.stencils, blockIdx.x, false,
+                           fields.entries, SolidHessian{});
 }
 
 template <class T>

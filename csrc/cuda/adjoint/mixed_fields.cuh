@@ -9,7 +9,7 @@ template <class T>
 struct MixedFieldWork : FieldWork<T> {
   StencilWork<T> stencils;
   EffectViews<T> effects;
-  double* energies;                      // [batch, patches] of the stencils
+  double* energies;                    // [batch, patches] of the stencils
   int counts[int(KindNumber::count)];  // stencils of each kind
 };
 
@@ -170,8 +170,9 @@ void run_stiffness(const MixedFieldWork<T>& work, cudaStream_t stream) {
   const std::int64_t blocks =
       work.stencils.plan.blocks + (tets + stencil_lanes - 1) / stencil_lanes;
   const std::int64_t threads = work.field.batch * blocks * stencil_lanes;
-  element_stiffness<T><<<blocks_of((threads + field_threads - 1) / field_threads), field_threads, 0,
-                         stream>>>(work, elements);
+  element_stiffness<T>
+      <<<blocks_of((threads + field_threads - 1) / field_threads), field_threads, 0, stream>>>(
+          work, elements);
   check(cudaGetLastError());
 }
 

@@ -91,8 +91,7 @@ BlockShape block_shape(int pairs, int environments, std::size_t shared) {
   for (int threads = warp_size; threads <= resident_threads<T>; threads += warp_size) {
     const int per_multiprocessor = std::min(fit, resident_threads<T> / threads);
     const int rounds = (pairs + threads - 1) / threads;
-    BlockShape shape = {threads, per_multiprocessor,
-                        double(per_multiprocessor) * pairs / rounds};
+    BlockShape shape = {threads, per_multiprocessor, double(per_multiprocessor) * pairs / rounds};
     if (shape.rank() > best.rank()) best = shape;
     const bool few = environments > 0 && environments <= per_multiprocessor;
     if (!few || rounds > most_fitted_rounds) continue;

@@ -31,7 +31,8 @@ namespace pd::inline PD_TARGET {
 // addition, a patch has so few vertices of its own that each gets eight lanes instead of four.
 //
 // `HasStencils`, one patch: the scene has other elements than tetrahedra, or no tetrahedra.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared, bool HasStencils>
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
 class FusedRunner {
   static_assert(!HasStencils || Kind == Blocks::one);
   using Call = std::conditional_t<HasStencils, MixedFusedCall<T>, FusedCall<T>>;

@@ -9,8 +9,8 @@ template <Visit What, class T, bool HasContacts>
 __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
     mixed_patches(const __grid_constant__ MixedStreamCall<T> call, int k) {
   extern __shared__ __align__(16) std::byte shared[];
-  update_patch<What, T, HasContacts>(
-      call, k, shared, StencilsOfPass<T>{call.stencils, call.step.settings.weighted});
+  update_patch<What, T, HasContacts>(call, k, shared,
+                                     StencilsOfPass<T>{call.stencils, call.step.settings.weighted});
 }
 
 template <class T>

@@ -63,7 +63,8 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, c
   for (int c = 0; c < 5; ++c) vertex[c] = patch.vertex[pair.corner[c]];
   double volume[2];
   for (int which = 0; which < 2; ++which) {
-    const Rest rest = rest_of(mesh.elements.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
+    const Rest rest =
+        rest_of(mesh.elements.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
     plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
     if (!plan.pair_factor.empty())
       plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
@@ -274,8 +275,8 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
   const std::int64_t vertices = elements.vertices;
   Mesh mesh{elements, {}, {}, {}, kernel};
   if (kernel == cluster_kernel) {
-    Ownership owned = own_vertices(elements.positions, vertices, elements.tets, elements.tet_count,
-                                   patches);
+    Ownership owned =
+        own_vertices(elements.positions, vertices, elements.tets, elements.tet_count, patches);
     mesh.partition = std::move(owned.mesh);
     mesh.owner = std::move(owned.owner);
     mesh.numbering = number_owned(mesh.owner, patches);

@@ -105,8 +105,7 @@ void add_stencils(MeshPatch& patch, const MeshElements& all, std::span<const std
 // `number` [vertices] is -1 before and after the call.
 MeshPatch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& number) {
   const std::span<const std::int32_t> elements = mesh.partition.patch(index);
-  const auto end =
-      std::lower_bound(elements.begin(), elements.end(), mesh.elements.tet_count);
+  const auto end = std::lower_bound(elements.begin(), elements.end(), mesh.elements.tet_count);
   const auto tets = elements.first(std::size_t(end - elements.begin()));
   MeshPatch patch;
   const auto local = [&](std::int64_t v) {

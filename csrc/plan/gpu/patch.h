@@ -47,7 +47,7 @@ struct MeshPatch {
   std::vector<std::int32_t> forces;  // entries that each slot sums
   std::vector<Pair> pairs;           // user's tetrahedra; corners are slots
   std::vector<PatchStencils> stencils;
-  std::int64_t outer = 0;            // number of leading pairs that may touch shared vertices
+  std::int64_t outer = 0;  // number of leading pairs that may touch shared vertices
   std::int64_t entries = 0;
   bool piped = false;  // whether cuda/stream/pipeline.h reads and writes the entries
 
