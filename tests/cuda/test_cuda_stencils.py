@@ -131,7 +131,7 @@ def test_a_rollout_is_its_steps(kernel: str, precision: str) -> None:
     sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=10)
     state, forces = different(sim, "mixed", 5)
     state, forces = moved(state, GPU), forces.to(GPU)
-    track = sim.rollout(state, 3, forces)
+    track = sim.rollout(state, 3, forces=forces)
     for step in range(3):
         state = sim(state, forces)
         assert torch.equal(track.positions[step], state.positions)
@@ -200,7 +200,9 @@ def test_fields_are_those_of_the_cpu(name: str, kernel: str, own: bool, precisio
                 check(one, two, expected, precision)
 
 
-def gradients(sim: pd.Simulator, state: pd.State, forces: Tensor, rows: dict[str, Tensor]) -> dict[str, Tensor]:
+def gradients(
+    sim: pd.Simulator, state: pd.State, forces: Tensor, rows: dict[str, Tensor], weight: Tensor
+) -> dict[str, Tensor]:
     """Of a loss after two steps, for the state, the forces and every array of the material."""
     given = {name: getattr(sim, name).detach() for name in sim.material_names} | {
         name: row.to(sim.device, sim.dtype) for name, row in rows.items()
@@ -210,8 +212,8 @@ def gradients(sim: pd.Simulator, state: pd.State, forces: Tensor, rows: dict[str
 
     def run() -> Tensor:
         after = sim(sim(pd.State(starts[0], starts[1]), starts[2]), starts[2])
-        weight = noise(after.positions, 5)
-        return (weight * after.positions).sum() + 0.01 * (weight * after.velocities).sum()
+        scale = weight.to(after.positions)
+        return (scale * after.positions).sum() + 0.01 * (scale * after.velocities).sum()
 
     with torch.enable_grad():
         loss = torch.func.functional_call(_Loss(sim, run), {f"sim.{name}": row for name, row in given.items()}, ())
@@ -237,7 +239,8 @@ def test_gradients_of_every_row_are_those_of_the_cpu(name: str, kernel: str, own
     sims = pair(name, kernel, precision, iterations=1500)
     state, forces = different(sims[1], name, 3)
     rows = own_rows(sims[1], 3) if own else {}
-    one, two, wide = (gradients(sim, state, forces, rows) for sim in sims)
+    weight = noise(state.positions, 5)
+    one, two, wide = (gradients(sim, state, forces, rows, weight) for sim in sims)
     assert one.keys() == wide.keys()
     for key, expected in wide.items():
         if not expected.abs().max() > 0.0:
@@ -252,13 +255,12 @@ def test_gradients_of_every_row_are_those_of_the_cpu(name: str, kernel: str, own
 def test_gradients_do_not_feel_their_batch(kernel: str, precision: str) -> None:
     sim = on_gpu(sheet_case(), DTYPES[precision], kernel, iterations=200)
     state, forces = different(sim, "sheet", 40)
-    rows = own_rows(sim, 40)
-    together = gradients(sim, state, forces, rows)
+    rows, weight = own_rows(sim, 40), noise(state.positions, 5)
+    together = gradients(sim, state, forces, rows, weight)
 
     def some(items: slice) -> dict[str, Tensor]:
-        return gradients(
-            sim, pd.State(*(t[items] for t in state)), forces[items], {k: r[items] for k, r in rows.items()}
-        )
+        start = pd.State(*(t[items] for t in state))
+        return gradients(sim, start, forces[items], {k: r[items] for k, r in rows.items()}, weight[items])
 
     for items in (slice(0, 1), slice(17, 20), slice(0, 40)):
         alone = some(items)
