@@ -49,6 +49,14 @@ class FusedRunner {
   using OwnHalo = Halo<T, InShared ? 8 : 4>;
   using LoadedVertex = typename Vertices<T, HasContacts>::LoadedVertex;
 
+  struct Stencils {
+    const StencilWork<T>& work;
+    PD_DEVICE explicit Stencils(const Call& call) : work(call.stencils) {}
+  };
+  struct NoStencils {
+    PD_DEVICE explicit NoStencils(const Call&) {}
+  };
+
   // A slot, as one thread updates it in a pass.
   struct WorkItem {
     int slot, row;
@@ -60,7 +68,7 @@ class FusedRunner {
  public:
   // `shared`: size from FusedLaunch
   PD_DEVICE FusedRunner(const Call& call, std::byte* shared)
-      : launched_(call),
+      : stencils_(call),
         call_(call.step),
         plan_(call.step.plan),
         set_(call.step.settings),
@@ -282,8 +290,8 @@ class FusedRunner {
       };
       if constexpr (HasStencils) {
         return each_pair_and_stencil<1>(patch_, read, rest_of<false>(patch_), weights(),
-                                        launched_.stencils, in_.environment, set_.weighted,
-                                        entries_, element);
+                                        stencils_.work, in_.environment, set_.weighted, entries_,
+                                        element);
       } else {
         return each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_, element);
       }
@@ -439,7 +447,7 @@ class FusedRunner {
     if (index_ == 0 && threadIdx.x == 0) in_.write_info(record, control_.progress);
   }
 
-  const Call& launched_;
+  std::conditional_t<HasStencils, Stencils, NoStencils> stencils_;
   const DeviceStep<T>& call_;
   const DevicePlan<T>& plan_;
   const Settings& set_;
