@@ -12,9 +12,10 @@ def build_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],
     stencils: Stencils,
+    tet_group: NDArray[int64] | None,
     patch_size: int,
     progress: Callable[[float], None],
-) -> dict[str, NDArray[Any]]: ...
+) -> dict[str, Any]: ...
 def build_device_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],

@@ -44,7 +44,8 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   };
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
-  const EffectArrays<T> effects(Backend::stencil_counts(call), t.material, call.batch, place);
+  const EffectArrays<T> effects(Backend::stencil_counts(call), call.plan.tets, t.material,
+                                call.batch, place);
   call.effects = effects.view;
   call.inertia = of_vertices(a, "inertia", "N/m");
   call.inverse = of_vertices(inverse, "inverse", "of the diagonal [m/N], 0 for what is held");

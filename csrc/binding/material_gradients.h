@@ -127,7 +127,7 @@ class MaterialGradients {
     return reduce(name(), array, (width > 1 ? 1 : 0) + (std::string_view(#rows) != "one"));
 #define EFFECT(name, width, rows, meaning) \
   if (place == place_in_material(#name))   \
-    return reduce(-of_effects()[place - material_arrays], array, width > 1 ? 2 : 1);
+    return reduce(-of_effects(place - material_arrays), array, width > 1 ? 2 : 1);
 #include "views/material.def"
 #undef X
     TORCH_INTERNAL_ASSERT(false);
@@ -160,6 +160,7 @@ class MaterialGradients {
   Tensor held_gradient() const { return t_.grad_positions + t_.grad_velocities / h_ - product(); }
 
   Tensor stiffness() const {
+    if (has_poisson(t_.material)) return -of_lame().select(-1, 0);
     static const auto op =
         find_op<Tensor(const Tensor&, const Tensor&, at::TensorList, at::TensorList)>(
             "torchpd::element_energy_product");
@@ -168,12 +169,23 @@ class MaterialGradients {
     return -op.call(t_.after, multiplier_, unit, t_.plan);
   }
 
-  const std::vector<Tensor>& of_effects() const {
+  // by E and nu
+  const Tensor& of_lame() const {
+    static const auto op =
+        find_op<Tensor(const Tensor&, const OptionalTensor&, at::TensorList, at::TensorList)>(
+            "torchpd::lame_product");
+    if (!of_lame_) of_lame_ = op.call(t_.after, multiplier_, t_.material, t_.plan);
+    return *of_lame_;
+  }
+
+  Tensor of_effects(std::size_t number) const {
+    if (number + material_arrays == place_in_material("poisson") && has_poisson(t_.material))
+      return of_lame().select(-1, 1);
     static const auto op =
         find_op<std::vector<Tensor>(const Tensor&, const OptionalTensor&, at::TensorList,
                                     at::TensorList)>("torchpd::effect_products");
     if (!of_effects_) of_effects_ = op.call(t_.after, multiplier_, t_.material, t_.plan);
-    return *of_effects_;
+    return (*of_effects_)[number];
   }
 
   Tensor masses() const {
@@ -213,6 +225,7 @@ class MaterialGradients {
   const LossMask& loss_mask_;
   double h_;
   mutable std::optional<std::tuple<Tensor, Tensor>> of_contacts_;
+  mutable std::optional<Tensor> of_lame_;
   mutable std::optional<std::vector<Tensor>> of_effects_;
 };
 

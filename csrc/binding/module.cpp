@@ -149,12 +149,21 @@ std::vector<std::int32_t> stencil_sizes(const pd::MeshPlan& plan, const pd::Mesh
   return sizes;
 }
 
+// Groups of tetrahedra that average their trace, from the number of each tetrahedron's.
+pd::TetGroups tet_groups(const std::optional<Indices>& group, const Indices& tets) {
+  if (!group || tets.shape(0) == 0) return {};
+  if (group->ndim() != 1 || group->shape(0) != tets.shape(0))
+    throw py::value_error("tet_group must be int64 [tets], the number of each one's group");
+  return pd::groups_of(group->data(), tets.data(), tets.shape(0));
+}
+
 py::dict build_plan(const Doubles& positions, const Indices& tets,
-                    const std::vector<Stencils>& stencils, int patch_size,
-                    const std::function<void(double)>& progress) {
-  const pd::MeshElements elements = mesh_elements(positions, tets, stencils);
-  if (patch_size < 16 || patch_size > 4096)
-    throw py::value_error("patch_size must lie in 16..4096");
+                    const std::vector<Stencils>& stencils, const std::optional<Indices>& tet_group,
+                    int patch_size, const std::function<void(double)>& progress) {
+  pd::MeshElements elements = mesh_elements(positions, tets, stencils);
+  elements.averaged = tet_groups(tet_group, tets);
+  if (patch_size < 16 || patch_size > 8192)
+    throw py::value_error("patch_size must lie in 16..8192");
   auto plan = pd::build_plan(elements, patch_size, progress);
   py::dict arrays;
   std::map<std::string, int> widths;
@@ -177,6 +186,7 @@ py::dict build_plan(const Doubles& positions, const Indices& tets,
   add("slot_vertex", plan.slot_vertex);
   add("shared_start", plan.shared_start);
   add("shared_slot", plan.shared_slot);
+  arrays["members"] = elements.averaged.members;
   if (stencils.empty()) return arrays;
   auto sizes = stencil_sizes(plan, elements, widths.at("stencil_order"));
   add("stencil_sizes", sizes);
@@ -430,7 +440,7 @@ PYBIND11_MODULE(_C, m) {
       py::module_::import("threading").attr("main_thread")().attr("ident").cast<unsigned long>();
   pd::Interrupt::set_check(&run_signal_handlers);
   m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("stencils"),
-        py::arg("patch_size"), py::arg("progress"));
+        py::arg("tet_group"), py::arg("patch_size"), py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
         py::arg("stencils"), py::arg("patches"), py::arg("kernel"), py::arg("fixed"),
         py::arg("piece"), py::arg("progress"));

@@ -142,6 +142,9 @@ TORCH_LIBRARY(torchpd, m) {
       "-> Tensor");
   with_plan("effect_energy(Tensor positions, Tensor[] material, Tensor[] plan) -> Tensor");
   with_plan(
+      "lame_product(Tensor positions, Tensor? direction, Tensor[] material, Tensor[] plan) -> "
+      "Tensor");
+  with_plan(
       "effect_products(Tensor positions, Tensor? direction, Tensor[] material, Tensor[] plan) -> "
       "Tensor[]");
   with_plan("elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted) -> Tensor");

@@ -41,7 +41,8 @@ void step_typed(const StepTensors& t, const Settings& settings) {
   check_vertices(t.positions, call.plan.vertices);
   check_levels(call.plan, settings.multilevel());
   call.material = material_view<T>(call.plan, t.material, call.batch, place);
-  call.effects = effects_view<T>(Backend::stencil_counts(call), t.material, call.batch, place);
+  call.effects =
+      effects_view<T>(Backend::stencil_counts(call), call.plan.tets, t.material, call.batch, place);
   check_tets(t.material[0], call.plan.tets);
   call.settings = settings;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
@@ -159,7 +160,8 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
   const Tensor d = direction.defined() ? direction.contiguous() : Tensor();
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
-  const EffectArrays<T> effects(Backend::stencil_counts(call), material, call.batch, place);
+  const EffectArrays<T> effects(Backend::stencil_counts(call), call.plan.tets, material, call.batch,
+                                place);
   call.effects = effects.view;
   for (std::size_t i = 0; i < products.size(); ++i) {
     if (products[i].numel() > 0) call.products[i] = products[i].template mutable_data_ptr<T>();
@@ -180,9 +182,10 @@ Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
   const Tensor& stiffness = array_of(material, "stiffness");
   TORCH_CHECK_VALUE(stiffness.dim() >= 1, "stiffness must be [tet] or [batch, tet] (Pa), got ",
                     describe(stiffness));
-  const Tensor out = per_element
-                         ? at::empty({positions.size(0), stiffness.size(-1)}, positions.options())
-                         : at::empty(positions.sizes(), positions.options());
+  std::vector<std::int64_t> shape = positions.sizes().vec();
+  if (per_element) shape = {positions.size(0), stiffness.size(-1)};
+  if (field == Field::lame_product) shape = {positions.size(0), stiffness.size(-1), 2};
+  const Tensor out = at::empty(shape, positions.options());
   if (positions.scalar_type() == at::kFloat) {
     field_typed<Backend, float>(field, positions, direction, material, plan, out);
   } else {
@@ -191,7 +194,7 @@ Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
   return out;
 }
 
-// Energy of the stencils of every environment [batch].
+// Elastic energy of every environment [batch].
 template <class Backend>
 Tensor effect_energy(const Tensor& positions, at::TensorList material, at::TensorList plan) {
   check_positions(positions, "positions");
@@ -202,6 +205,18 @@ Tensor effect_energy(const Tensor& positions, at::TensorList material, at::Tenso
     field_typed<Backend, double>(Field::effect_energy, positions, {}, material, plan, out);
   }
   return out;
+}
+
+// Derivatives by Young's modulus and Poisson's ratio of every tetrahedron [batch, tets, 2]: of the gradient's product with
+// a direction, or else of the energy.
+template <class Backend>
+Tensor lame_product(const Tensor& positions, const OptionalTensor& direction,
+                    at::TensorList material, at::TensorList plan) {
+  TORCH_CHECK_VALUE(has_poisson(material),
+                    "material.poisson must be [tets] or [batch, tets] for "
+                    "the derivatives by it, got none");
+  return run_field<Backend>(Field::lame_product, positions, direction.value_or(Tensor()), material,
+                            plan);
 }
 
 // Derivatives by each array of the effects, [batch, rows]: of the gradient's product with a direction, or else of the
@@ -223,6 +238,10 @@ std::vector<Tensor> effect_products(const Tensor& positions, const OptionalTenso
     field_typed<Backend, float>(field, positions, along, material, plan, out, {}, products);
   } else {
     field_typed<Backend, double>(field, positions, along, material, plan, out, {}, products);
+  }
+  if (has_poisson(material)) {
+    products[place_in_material("poisson") - material_arrays] =
+        lame_product<Backend>(positions, direction, material, plan).select(-1, 1);
   }
   return products;
 }
@@ -262,10 +281,11 @@ Tensor material_field(Field field, at::TensorList material, at::TensorList plan,
   const std::optional<std::int64_t> own = environments_of(material);
   const bool batched = own.has_value();
   call.batch = own.value_or(1);
-  const EffectArrays<T> effects(Backend::stencil_counts(call), material, call.batch, place);
+  const EffectArrays<T> effects(Backend::stencil_counts(call), call.plan.tets, material, call.batch,
+                                place);
   call.effects = effects.view;
   const int32* counts = Backend::stencil_counts(call);
-  if (field == Field::stiffness_at_rest && !counts) return w.clone();
+  if (field == Field::stiffness_at_rest && !counts && !has_poisson(material)) return w.clone();
   const std::int64_t rows =
       field == Field::diagonal ? call.plan.vertices : count_elements(call.plan.tets, counts);
   const Tensor out =
@@ -291,7 +311,7 @@ Tensor elastic_diagonal(at::TensorList material, at::TensorList plan, bool weigh
              : diagonal_typed<Backend, double>(material, plan, weighted);
 }
 
-// Stiffness of every element at rest, as a preconditioner takes it, [elements] or [batch, elements]: Young's modulus of
+// Stiffness of every element at rest, as a preconditioner takes it, [elements] or [batch, elements]: that of
 // tetrahedra [Pa], then that of stencils kind by kind.
 template <class Backend>
 Tensor stiffness_at_rest(at::TensorList material, at::TensorList plan) {
@@ -375,6 +395,7 @@ void register_ops(torch::Library& m) {
   m.impl("element_energy", &element_energy<Backend>);
   m.impl("element_energy_product", &element_energy_product<Backend>);
   m.impl("effect_energy", &effect_energy<Backend>);
+  m.impl("lame_product", &lame_product<Backend>);
   m.impl("effect_products", &effect_products<Backend>);
   m.impl("elastic_diagonal", &elastic_diagonal<Backend>);
   m.impl("stiffness_at_rest", &stiffness_at_rest<Backend>);

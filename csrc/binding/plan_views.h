@@ -175,11 +175,17 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.slots = size[plan_slots];
   plan.shared = size[plan_shared];
   plan.most_slots = size[plan_most_slots];
+  plan.members = size[plan_members];
   TORCH_CHECK_VALUE(plan.patches >= 1 && plan.most_slots >= 1 && plan.most_slots <= plan.slots,
                     "plan.sizes must count at least one patch, and no more slots in one than in "
                     "all, got ",
                     plan.patches, " patches with up to ", plan.most_slots, " of ", plan.slots,
                     " slots; compile the scene again");
+  TORCH_CHECK_VALUE((plan.members == 1 || plan.members == 2 || plan.members == 4) &&
+                        plan.blocks % plan.members == 0,
+                    "plan.sizes must have groups of 1, 2 or 4 tetrahedra, and whole groups of "
+                    "blocks, got ",
+                    plan.members, " and ", plan.blocks, " blocks; compile the scene again");
   PlanRows count{};
   count.size = plan_size_count;
   count.vertex = plan.vertices;
@@ -446,13 +452,27 @@ inline void check_effects(const int32* counts, at::TensorList material) {
 #undef KIND
 }
 
+// Whether a material has Poisson's ratio.
+inline bool has_poisson(at::TensorList material) {
+  return material.size() > material_arrays && array_of(material, "poisson").size(-1) > 0;
+}
+
+inline void check_poisson(at::TensorList material, std::int64_t tets) {
+  const Tensor& poisson = array_of(material, "poisson");
+  TORCH_CHECK_VALUE(poisson.dim() >= 1 && (poisson.size(-1) == 0 || poisson.size(-1) == tets),
+                    "material.poisson must be [", tets, "] or [batch, ", tets,
+                    "], one value per tetrahedron of the plan, or [0] in a scene without, got ",
+                    describe(poisson));
+}
+
 // The arrays that only some scenes have.
 template <class T>
-Effects<T> effects_view(const int32* counts, at::TensorList arrays, std::int64_t batch,
-                        const Place& place) {
+Effects<T> effects_view(const int32* counts, std::int64_t tets, at::TensorList arrays,
+                        std::int64_t batch, const Place& place) {
   Effects<T> effects;
   check_effects(counts, arrays);
   if (arrays.size() == material_arrays) return effects;
+  check_poisson(arrays, tets);
   int at = material_arrays;
 #define X(name, width, rows, meaning)
 #define EFFECT(name, width, rows, meaning)                                                        \
@@ -470,11 +490,11 @@ struct EffectArrays {
   std::vector<Tensor> kept;
   Effects<T> view;
 
-  EffectArrays(const int32* counts, at::TensorList material, std::int64_t batch,
+  EffectArrays(const int32* counts, std::int64_t tets, at::TensorList material, std::int64_t batch,
                const Place& place) {
     if (material.size() > material_arrays) {
       for (const Tensor& array : material) kept.push_back(array.contiguous());
-      view = effects_view<T>(counts, kept, batch, place);
+      view = effects_view<T>(counts, tets, kept, batch, place);
     } else {
       check_effects(counts, material);
     }

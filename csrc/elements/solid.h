@@ -3,8 +3,10 @@
 //   E = w V / 2 |F - R|^2,   F = Ds Dm^-1,   R = nearest rotation to F       (Vyatkin and Dolgovesov 2023; st = w / 2)
 //   dE/dx_c = w V (F - R) grad N_c,   grad N_c = row c-1 of Dm^-1 for c > 0, minus their sum for c = 0
 //
-// R is constant in the gradient: it maximises tr(R^T F), so its own change does no first-order work.
+// R is constant in the gradient: it maximises tr(R^T F), so its own change does no first-order work. Elements with
+// Poisson's ratio come in groups, see elements/corotated.h; for them w is 2 mu.
 #pragma once
+#include "elements/corotated.h"
 #include "elements/solid_pair.h"
 
 namespace pd::inline PD_TARGET {
@@ -85,6 +87,7 @@ struct SolidGradient {
       i[s] = invariants(f[s]);
     }
     for (int s = 0; s < N; ++s) root[s] = largest_root(i[s]);
+    if constexpr (Grouped<Elements>) return run_groups<N>(elements, f, i, root);
     for (int s = 0; s < N; ++s) {
       const R weight = elements.weight(s);
       Mat3<R> stress = finish_strain(f[s], i[s], root[s], Energy ? R(scalar_of<R>(1)) : weight);
@@ -98,6 +101,39 @@ struct SolidGradient {
       Vec3<R> g[4];
       corner_forces(stress, elements.rest(s), g);
       elements.add(s, g);
+    }
+  }
+
+ private:
+  template <int N, class Elements, class R>
+  PD_HD void run_groups(const Elements& elements, const Mat3<R> (&f)[N],
+                        const Invariants<R> (&i)[N], const Root<R> (&root)[N]) const {
+    constexpr int members = Elements::members;
+    const R half(scalar_of<R>(0.5));
+    for (int first = 0; first < N; first += members) {
+      Mat3<R> strain[members];
+      R trace[members], weight[members], pressure[members];
+      for (int m = 0; m < members; ++m) {
+        const int s = first + m;
+        strain[m] = finish_strain(f[s], i[s], root[s], R(scalar_of<R>(1)));
+        trace[m] = trace_strain(f[s], strain[m]);
+        weight[m] = elements.weight(s);
+        pressure[m] = elements.pressure(s);
+      }
+      const GroupTension<R> tension(trace, weight, pressure);
+      for (int m = 0; m < members; ++m) {
+        const int s = first + m;
+        if (Energy && wanted) {
+          elements.sum(s) = multiply_add(
+              half * weight[m], frobenius(strain[m], strain[m]),
+              multiply_add(pressure[m], tension.energy(), elements.sum(s)));
+        }
+        Vec3<R> g[4];
+        corner_forces(
+            corotated_stress(f[s], strain[m], weight[m], pressure[m] * tension.slope),
+            elements.rest(s), g);
+        elements.add(s, g);
+      }
     }
   }
 };
@@ -127,6 +163,55 @@ PD_HD R element_energy_product(const Vec3<R> (&x)[4], const Vec3<R> (&dx)[4],
   return weight * frobenius(strain(x, rest_inverse), deformation_gradient(dx, rest_inverse));
 }
 
+// A group of elements at field 0.
+template <class R, int Members>
+struct GroupState {
+  Mat3<R> f[Members], rotation[Members];
+  R trace[Members], weight[Members], pressure[Members];
+
+  template <class Elements>
+  PD_HD GroupState(const Elements& elements, int first) {
+    for (int m = 0; m < Members; ++m) {
+      Vec3<R> x[4];
+      elements.corners(first + m, 0, x);
+      f[m] = deformation_gradient(x, elements.rest(first + m));
+      rotation[m] = nearest_rotation(f[m]);
+      trace[m] = frobenius(rotation[m], f[m] - rotation[m]);
+      weight[m] = elements.weight(first + m);
+      pressure[m] = elements.pressure(first + m);
+    }
+  }
+
+  // |F - R|^2 / 2
+  PD_HD R square(int m) const {
+    const Mat3<R> strain = f[m] - rotation[m];
+    return R(scalar_of<R>(0.5)) * frobenius(strain, strain);
+  }
+};
+
+// The same with its derivative along field 1.
+template <class R, int Members>
+struct GroupChange : GroupState<R, Members> {
+  Mat3<R> df[Members];
+  R change[Members];  // R : dF
+
+  template <class Elements>
+  PD_HD GroupChange(const Elements& elements, int first)
+      : GroupState<R, Members>(elements, first) {
+    for (int m = 0; m < Members; ++m) {
+      Vec3<R> dx[4];
+      elements.corners(first + m, 1, dx);
+      df[m] = deformation_gradient(dx, elements.rest(first + m));
+      change[m] = frobenius(this->rotation[m], df[m]);
+    }
+  }
+
+  // (F - R) : dF
+  PD_HD R strain_change(int m) const {
+    return frobenius(this->f[m] - this->rotation[m], df[m]);
+  }
+};
+
 // Second derivative of every element's energy at field 0, along field 1.
 struct SolidHessian {
   static constexpr int strip = 1;
@@ -134,12 +219,33 @@ struct SolidHessian {
   template <int N, class Elements>
   PD_HD void run(const Elements& elements) const {
     using R = typename Elements::R;
+    if constexpr (Grouped<Elements>) return run_groups<N, R>(elements);
     for (int s = 0; s < N; ++s) {
       Vec3<R> x[4], dx[4], g[4];
       elements.corners(s, 0, x);
       elements.corners(s, 1, dx);
       solid_hessian_product(x, dx, elements.rest(s), elements.weight(s), g);
       elements.add(s, g);
+    }
+  }
+
+ private:
+  template <int N, class R, class Elements>
+  PD_HD void run_groups(const Elements& elements) const {
+    constexpr int members = Elements::members;
+    for (int first = 0; first < N; first += members) {
+      const GroupChange<R, members> group(elements, first);
+      const GroupTension<R> tension(group.trace, group.weight, group.pressure);
+      const R change = tension.curvature() * group_average(group.change, group.pressure);
+      for (int m = 0; m < members; ++m) {
+        const Mat3<R> dr = rotation_differential(group.f[m], group.rotation[m], group.df[m]);
+        Vec3<R> g[4];
+        corner_forces(corotated_stress_change(group.df[m], group.rotation[m], dr, group.weight[m],
+                                              group.pressure[m] * tension.slope,
+                                              group.pressure[m] * change),
+                      elements.rest(first + m), g);
+        elements.add(first + m, g);
+      }
     }
   }
 };
@@ -165,8 +271,110 @@ struct SolidDiagonal {
   }
 };
 
+// V lambda phi(t) of every element, t of its group; `visit(s, energy)`.
+template <int N, class Elements, class Visit>
+PD_HD void each_tension(const Elements& elements, const Visit& visit) {
+  using R = typename Elements::R;
+  constexpr int members = Elements::members;
+  for (int first = 0; first < N; first += members) {
+    const GroupState<R, members> group(elements, first);
+    const R energy = GroupTension<R>(group.trace, group.weight, group.pressure).energy();
+    for (int m = 0; m < members; ++m) visit(first + m, group.pressure[m] * energy);
+  }
+}
+
+// Energy of every element; with Poisson's ratio its share V (mu |F - R|^2 + lambda phi(t)) of its group's. Like the
+// fields below, it passes numbers to write(elements, s, numbers...).
+struct ElementEnergy {
+  template <int N, class Elements, class Write>
+  PD_HD void run(const Elements& elements, const Write& write) const {
+    using R = typename Elements::R;
+    [[maybe_unused]] R tension[N];
+    if constexpr (Grouped<Elements>)
+      each_tension<N>(elements, [&](int s, const R& energy) { tension[s] = energy; });
+    for (int s = 0; s < N; ++s) {
+      Vec3<R> x[4];
+      elements.corners(s, 0, x);
+      const Mat3<R> d = strain(x, elements.rest(s));
+      R energy = R(scalar_of<R>(0.5)) * elements.weight(s) * frobenius(d, d);
+      if constexpr (Grouped<Elements>) energy = energy + tension[s];
+      write(elements, s, energy);
+    }
+  }
+};
+
+// Derivative of that energy along field 1.
+struct ElementEnergyProduct {
+  template <int N, class Elements, class Write>
+  PD_HD void run(const Elements& elements, const Write& write) const {
+    using R = typename Elements::R;
+    if constexpr (Grouped<Elements>) {
+      constexpr int members = Elements::members;
+      for (int first = 0; first < N; first += members) {
+        const GroupChange<R, members> group(elements, first);
+        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
+        const R change = tension.slope * group_average(group.change, group.pressure);
+        for (int m = 0; m < members; ++m)
+          write(elements, first + m,
+                multiply_add(group.pressure[m], change, group.weight[m] * group.strain_change(m)));
+      }
+    } else {
+      for (int s = 0; s < N; ++s) {
+        Vec3<R> x[4], dx[4];
+        elements.corners(s, 0, x);
+        elements.corners(s, 1, dx);
+        write(elements, s,
+              element_energy_product(x, dx, elements.rest(s), elements.weight(s)));
+      }
+    }
+  }
+};
+
+// Derivatives of the energy by V 2 mu and V lambda of every element in a group.
+struct LameSlope {
+  template <int N, class Elements, class Write>
+  PD_HD void run(const Elements& elements, const Write& write) const {
+    using R = typename Elements::R;
+    if constexpr (Grouped<Elements>) {
+      constexpr int members = Elements::members;
+      for (int first = 0; first < N; first += members) {
+        const GroupState<R, members> group(elements, first);
+        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
+        R squares[members];
+        for (int m = 0; m < members; ++m) squares[m] = group.square(m);
+        const auto slopes = ParameterSlopes<R, members>::of_energy(
+            tension, group.trace, squares, group.weight, group.pressure);
+        for (int m = 0; m < members; ++m)
+          write(elements, first + m, slopes.by_weight[m], slopes.by_pressure[m]);
+      }
+    }
+  }
+};
+
+// The same of the energy's derivative along field 1.
+struct LameProduct {
+  template <int N, class Elements, class Write>
+  PD_HD void run(const Elements& elements, const Write& write) const {
+    using R = typename Elements::R;
+    if constexpr (Grouped<Elements>) {
+      constexpr int members = Elements::members;
+      for (int first = 0; first < N; first += members) {
+        const GroupChange<R, members> group(elements, first);
+        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
+        R strains[members];
+        for (int m = 0; m < members; ++m) strains[m] = group.strain_change(m);
+        const auto slopes = ParameterSlopes<R, members>::of_product(
+            tension, group.trace, strains, group.change, group.weight, group.pressure);
+        for (int m = 0; m < members; ++m)
+          write(elements, first + m, slopes.by_weight[m], slopes.by_pressure[m]);
+      }
+    }
+  }
+};
+
 // Terms of a report, for each corner of an element. They are a quarter of the energy [J]; w V |grad N_c|^2 |x|, the
-// force per relative error of positions [N]; and a quarter if det F <= 0. Padding has no weight and adds zeros.
+// force per relative error of positions [N]; and a quarter if det F <= 0. Padding has no weight and adds zeros. With
+// Poisson's ratio w is 2 mu + 3 lambda, the stiffness against dilation, in that force.
 struct SolidReport {
   static constexpr int strip = 1;
 
@@ -175,14 +383,22 @@ struct SolidReport {
     using R = typename Elements::R;
     using T = scalar_of<R>;
     const R none(T(0)), quarter(T(0.25));
+    [[maybe_unused]] R tension[N];
+    if constexpr (Grouped<Elements>)
+      each_tension<N>(elements, [&](int s, const R& energy) { tension[s] = energy; });
     for (int s = 0; s < N; ++s) {
       Vec3<R> x[4], n[4], share[4];
       elements.corners(s, 0, x);
       shape_gradients(elements.rest(s), n);
-      const R weight = elements.weight(s);
+      R weight = elements.weight(s);
       const Mat3<R> f = deformation_gradient(x, elements.rest(s)), d = f - nearest_rotation(f);
-      const R energy = (R(T(0.125)) * weight) * frobenius(d, d);
+      R energy = (R(T(0.125)) * weight) * frobenius(d, d);
       const auto inverted = determinant(f) <= none && weight > none;
+      if constexpr (Grouped<Elements>) {
+        energy = multiply_add(quarter, tension[s], energy);
+        const R pressure = elements.pressure(s);
+        weight = multiply_add(R(T(3)), select(pressure > none, pressure, none), weight);
+      }
       R size = none;
       for (int c = 0; c < 4; ++c) size = -lesser(-size, -dot(x[c], x[c]));
       size = square_root(size);

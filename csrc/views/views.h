@@ -21,6 +21,7 @@ enum PlanSize : int {
   plan_slots,
   plan_shared,
   plan_most_slots,
+  plan_members,
   plan_size_count
 };
 
@@ -88,6 +89,7 @@ struct Plan {
   int vertices = 0, tets = 0, pins = 0, components = 0, blocks = 0, patches = 0, slots = 0,
       shared = 0;
   int most_slots = 0;  // of any patch
+  int members = 1;     // tetrahedra of a group that averages its trace: 1, 2 or 4
   int stencil_blocks = 0,
       stencil_numbers = 0;  // blocks of 16 stencils; rows of 16 numbers of a step
   Levels<T> levels;
@@ -281,7 +283,8 @@ enum class Field : int {
   element_energy_product,
   diagonal,
   report,            // see SolidReport
-  effect_energy,     // energy of all stencils
+  effect_energy,     // elastic energy of all elements
+  lame_product,      // derivatives by E and nu, of gradient times direction or else of the energy
   effect_products,   // derivatives by the arrays of the effects
   stiffness_at_rest  // of every element, as preconditioners take it
 };
@@ -299,7 +302,8 @@ struct FieldCall : P::EffectViews {
       nullptr;  // [batch, vertices, 3] added to the positions without rounding the sum; may be null
   const T* direction = nullptr;  // [batch, vertices, 3], for the products
   T* out =
-      nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, vertices] of the diagonal
+      nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, tets, 2] of lame_product,
+               // [batch, vertices] of the diagonal
   // stiffness_at_rest: [batch, elements], tetrahedra and then stencils kind by kind
 };
 

@@ -37,7 +37,7 @@ from runs import (
 
 import torchpd as pd
 from torchpd.plan import kernel_choice as regimes
-from torchpd.reference import StepProblem, nearest_rotation_fast
+from torchpd.reference import StepProblem
 from torchpd.reference.solvers import Iterates
 from torchpd.scene.pins import hold_exactly
 
@@ -183,9 +183,9 @@ class Rounded(StepProblem):
     def evaluate(self, displacement: Array) -> tuple[float, Array]:
         from_origin = self.positions - self.positions[self.origin]
         seen = (from_origin + displacement).astype(np.float32) - from_origin
-        deformation = self.deformation_gradients(seen)
-        stress = self.element_weight[:, None, None] * (deformation - nearest_rotation_fast(deformation))
-        forces = np.einsum("eij,eaj->eai", stress, self.geometry.shape_gradients).astype(np.float32)
+        (tets,) = self.groups
+        stress = tets.law.evaluate(tets.deformation(seen))[1]
+        forces = np.einsum("eij,eaj->eai", stress, tets.stencils.gradients).astype(np.float32)
         sums = np.zeros(displacement.shape, np.float32)
         np.add.at(sums, self.values.tets[self.order], forces[self.order])
         pull = self.weight[:, None] * (displacement - self.target)

@@ -182,12 +182,6 @@ def test_kernels_without_stencils_are_refused_by_name(kernel: str) -> None:
         choose_plan(sheet_case().scene.values(), torch.float32, H100, kernel)
 
 
-def test_poisson_is_refused_by_name() -> None:
-    values = pd.Scene(pd.Solid(pd.shapes.box((0.3, 0.2, 0.2), (3, 2, 2)), 1e5, poisson=0.3)).values()
-    with pytest.raises(ValueError, match=r"Solid\.poisson must be 0\.0 .* on a GPU"):
-        choose_plan(values, torch.float32, H100)
-
-
 def test_multilevel_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"solver must be Chebyshev\(\) or Jacobi\(\) .*cloth.* got Multilevel"):
         choose_plan(sheet_case().scene.values(), torch.float32, H100, levels=True)

@@ -232,7 +232,7 @@ def test_sizes_count_what_the_arrays_hold(plan: Plan, values: SceneValues) -> No
     assert plan.sizes.tolist() == [
         len(values.rest_positions), len(values.tets), len(values.pin_vertices), len(plan.component_size),
         len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
-        plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()),
+        plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()), 1,
     ]  # fmt: skip
 
 
@@ -262,11 +262,11 @@ def test_indices_are_checked_before_memory_is_touched() -> None:
         wrong = tets.copy()
         wrong[3, 2] = bad
         with pytest.raises(IndexError, match=r"tets .*positions"):
-            _C.build_plan(vertices, wrong, [], 128, lambda done: None)
+            _C.build_plan(vertices, wrong, [], None, 128, lambda done: None)
     with pytest.raises(ValueError, match=r"positions .*float64 \[vertices, 3\]"):
-        _C.build_plan(vertices[:, :2].copy(), tets, [], 128, lambda done: None)
+        _C.build_plan(vertices[:, :2].copy(), tets, [], None, 128, lambda done: None)
     with pytest.raises(ValueError, match=r"tets .*int64 \[count > 0, 4\]"):
-        _C.build_plan(vertices, tets[:0], [], 128, lambda done: None)
+        _C.build_plan(vertices, tets[:0], [], None, 128, lambda done: None)
 
 
 def test_a_mesh_that_32_bits_do_not_count_is_refused_unread(tmp_path: Path) -> None:
@@ -280,4 +280,4 @@ def test_a_mesh_that_32_bits_do_not_count_is_refused_unread(tmp_path: Path) -> N
             ValueError,
             match=rf"up to 2\^28 = {most} vertices and tetrahedra.* got {len(x)} and {len(t)}; take a coarser",
         ):
-            _C.build_plan(x, t, [], 128, lambda done: None)
+            _C.build_plan(x, t, [], None, 128, lambda done: None)

@@ -18,7 +18,6 @@ from stencil_scenes import (
     SOLID_CASES,
     SolidCase,
     StencilScene,
-    bare_values,
     capped_box,
     chain,
     cloth,
@@ -254,7 +253,7 @@ def test_a_scene_of_all_bodies_falls_as_one() -> None:
     first = problem.first_iterate("inertial")
     u = newton(problem, first)
     np.testing.assert_allclose(values.masses @ u / values.masses.sum(), [0.0, -9.8 * 0.02**2, 0.0], atol=1e-10)
-    assert problem.joined.tolist() == [True, True, True]
+    assert not values.component.any()
     assert relative_error(guarded_chebyshev(problem, first, iterations=1000).displacement, u, first) <= 1e-3
 
 
@@ -320,21 +319,6 @@ def test_no_damping_of_a_rigid_rotation() -> None:
     turned = problem.positions @ rotation(20.0, -50.0, 80.0).T
     stress = damper.law.evaluate(damper.deformation(turned - problem.positions))[1]
     assert np.abs(damper.nodal(stress)).max() <= 1e-12 * 1e5  # of viscosity / h
-
-
-def test_joined_components_have_no_rigid_motion_of_their_own() -> None:
-    """Two halves of a chain as two components, a spring between them: only unjoined ones are aligned."""
-    scene = chain()
-    halves = (np.arange(21) > 10).astype(np.int64)
-    apart = bare_values(scene.values.rest_positions, scene.values.masses, (), np.array([0]), component=halves)
-    joined = replace(apart, stencils=scene.problem().values.stencils)
-    problem = step_problem(joined, joined.rest_positions, scene.velocities, scene.time_step)
-    assert problem.joined.tolist() == [True, True]
-    guess = 0.001 * np.random.default_rng(0).standard_normal((21, 3))
-    np.testing.assert_array_equal(problem.align(guess), guess)
-    free = step_problem(apart, joined.rest_positions, scene.velocities, scene.time_step)
-    assert free.joined.tolist() == [False, False]
-    assert np.abs(free.align(guess) - guess)[11:].max() > 1e-4
 
 
 def test_negative_poisson_converges_from_hard_starts() -> None:

@@ -39,7 +39,8 @@ def step_diagonal(
 ) -> tuple[Tensor, Tensor]:
     """Inertia a and diagonal D of every vertex, [V] or [B, V], in N/m; inf at hard pins.
 
-    a_i = m_i / h^2 (1 + damping h) + k_i;  D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted.
+    a_i = m_i / h^2 (1 + damping h) + k_i;  D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted. With
+    Poisson's ratio 2 mu l_e + 4 lambda takes the place of l_e w_e, and 2 mu + lambda that of w_e.
     """
     material = named_material(material_arrays)
     masses, springs = material["masses"], material["pin_stiffness"]

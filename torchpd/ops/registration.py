@@ -31,6 +31,7 @@ INFO_WIDTH = _C.info_numbers
 
 _ops = torch.ops.torchpd
 _STIFFNESS = [row.name for row in MATERIAL_TABLE].index("stiffness")
+_POISSON = [row.name for row in MATERIAL_TABLE].index("poisson")
 _STENCIL_PLAN = len(PLAN_TABLE) + len(STENCIL_TABLE)
 _CORE = len(MATERIAL_TABLE) - len(EFFECT_ROWS)  # arrays that every scene has
 
@@ -138,6 +139,11 @@ def _(positions: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Se
 @_register_fake("effect_energy")
 def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
     return positions.new_empty(positions.shape[:1])
+
+
+@_register_fake("lame_product")
+def _(positions: Tensor, direction: Tensor | None, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+    return positions.new_empty((*positions.shape[:1], material[_STIFFNESS].shape[-1], 2))
 
 
 @_register_fake("effect_products")
@@ -295,14 +301,44 @@ def _sum_to_rows(material: Sequence[Tensor], each: Sequence[Tensor]) -> list[Ten
 
 def _effect_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
     positions, *material = ctx.saved_tensors
-    x, effects = None, None
+    stiffness, x, w, effects = material[_STIFFNESS], None, None, None
     if ctx.needs_input_grad[0]:
-        alone = _with_stiffness(material, torch.zeros_like(material[_STIFFNESS]))
-        x = grad[:, None, None] * _ops.gradient(positions, alone, ctx.plan)
+        x = grad[:, None, None] * _ops.gradient(positions, material, ctx.plan)
+    if ctx.needs_input_grad[1][_STIFFNESS]:
+        w = _sum_to_stiffness(grad[:, None] * _by_stiffness(positions, None, material, ctx.plan), stiffness)
     if any(ctx.needs_input_grad[1][_CORE:]):
         products = _ops.effect_products(positions, None, material, ctx.plan)
         effects = _sum_to_rows(material, [grad[:, None] * product for product in products])
-    return x, _for_material(material, None, effects), _for_plan(ctx)
+    return x, _for_material(material, w, effects), _for_plan(ctx)
+
+
+def _by_stiffness(
+    positions: Tensor, direction: Tensor | None, material: Sequence[Tensor], plan: Sequence[Tensor]
+) -> Tensor:
+    """Derivatives by the stiffness [B, E] of the energy, or of the gradient's product with a direction."""
+    if _has_poisson(material):
+        lame: Tensor = _ops.lame_product(positions, direction, material, plan)
+        return lame[..., 0]
+    unit = _with_stiffness(material, torch.ones_like(material[_STIFFNESS]))
+    found: Tensor
+    if direction is None:
+        found = _ops.element_energy(positions, unit, plan)
+    else:
+        found = _ops.element_energy_product(positions, direction, unit, plan)
+    return found
+
+
+def _has_poisson(material: Sequence[Tensor]) -> bool:
+    return len(material) > _CORE and material[_POISSON].shape[-1] > 0
+
+
+def _refuse_poisson(material: Sequence[Tensor]) -> None:
+    """Refuse derivatives of energies of single elements that average their trace over a group."""
+    if _has_poisson(material):
+        raise RuntimeError(
+            "torchpd: energies of single elements have no derivative with Poisson's ratio, which groups of elements "
+            "share; differentiate effect_energy, their sum"
+        )
 
 
 def _tets_alone(material: Sequence[Tensor], stiffness: Tensor) -> list[Tensor]:
@@ -323,6 +359,7 @@ def _for_plan(ctx: Any) -> list[None]:
 
 def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
     positions, *material = ctx.saved_tensors
+    _refuse_poisson(material)
     stiffness, x, w = material[_STIFFNESS], None, None
     if ctx.needs_input_grad[0]:
         x = _ops.gradient(positions, _tets_alone(material, grad * stiffness), _without_stencils(ctx.plan))
@@ -338,8 +375,7 @@ def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tens
     if ctx.needs_input_grad[0]:
         x = _ops.hessian_product(positions, grad, material, ctx.plan)
     if ctx.needs_input_grad[1][_STIFFNESS]:
-        unit = _with_stiffness(material, torch.ones_like(stiffness))
-        w = _sum_to_stiffness(_ops.element_energy_product(positions, grad, unit, ctx.plan), stiffness)
+        w = _sum_to_stiffness(_by_stiffness(positions, grad, material, ctx.plan), stiffness)
     if any(ctx.needs_input_grad[1][_CORE:]):
         effects = _sum_to_rows(material, _ops.effect_products(positions, grad, material, ctx.plan))
     return x, _for_material(material, w, effects), _for_plan(ctx)
@@ -349,6 +385,7 @@ def _element_energy_product_backward(
     ctx: Any, grad: Tensor
 ) -> tuple[Tensor | None, Tensor | None, list[Tensor | None], list[None]]:
     positions, direction, *material = ctx.saved_tensors
+    _refuse_poisson(material)
     stiffness, x, d, w = material[_STIFFNESS], None, None, None
     scaled, plan = _tets_alone(material, grad * stiffness), _without_stencils(ctx.plan)
     if ctx.needs_input_grad[0]:

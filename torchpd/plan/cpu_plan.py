@@ -183,12 +183,13 @@ def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
     return replace(plan, arrays=arrays, loose=values.loose)
 
 
-def _sizes(arrays: dict[str, NDArray[Any]], tets: int) -> NDArray[np.int32]:
+def _sizes(arrays: dict[str, NDArray[Any]], tets: int, members: Any) -> NDArray[np.int32]:
     """Counts of a CPU plan, in the order of PlanSize in csrc/views/views.h."""
     slots = np.diff(arrays["patch_slot"])
     counts = (
         len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), len(arrays["component_size"]),
         len(arrays["tet_order"]), len(slots), len(arrays["slot_vertex"]), len(arrays["shared_start"]) - 1, slots.max(),
+        members,
     )  # fmt: skip
     return np.array(counts, dtype=np.int32)
 
@@ -216,7 +217,7 @@ def compile_plan(
     Args:
         values: the flat arrays of `Scene.values`.
         dtype: torch.float32 or torch.float64.
-        patch_size: elements per patch, 16 to 4096; None chooses by mesh size.
+        patch_size: elements per patch, 16 to 8192; None chooses by mesh size.
         progress: show a bar when the mesh is large.
     """
     if dtype not in (torch.float32, torch.float64):
@@ -226,14 +227,15 @@ def compile_plan(
     stencils = stencil_arrays(values)
     with compile_progress(elements, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_plan(
-            values.rest_positions, values.tets, stencils, patch_size or _patch_size(elements), advance
+            values.rest_positions, values.tets, stencils, values.tet_group, patch_size or _patch_size(elements), advance
         )
+    members = arrays.pop("members")
     internal = internal_numbers(arrays["vertex_order"])
     group, component_size = loose_pieces(values)
     arrays["vertex_component"] = group[arrays["vertex_order"]]
     arrays["component_size"] = component_size
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
-    arrays["sizes"] = _sizes(arrays, tets)
+    arrays["sizes"] = _sizes(arrays, tets, members)
     table = PLAN_TABLE + STENCIL_TABLE if stencils else PLAN_TABLE
     tensors = (tensor_of(arrays[row.name]) for row in table)
     reals = tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors)

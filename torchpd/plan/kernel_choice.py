@@ -312,13 +312,8 @@ def _plan_that_fits(scene: _PlanBuilder, gpu: Properties, name: str, more: Calla
         patches = min(more(patches), scene.elements)
 
 
-def _check_effects(values: SceneValues, kernel: str, levels: bool) -> None:
-    """Refuse what no kernel computes."""
-    if values.poisson is not None:
-        raise ValueError(
-            "Simulator: Solid.poisson must be 0.0 for every solid on a GPU, got others; its kernels know no volume "
-            "strain: leave the simulator on the CPU"
-        )
+def _check_stencils(values: SceneValues, kernel: str, levels: bool) -> None:
+    """Refuse what scenes with stencils cannot have on a GPU."""
     if not values.stencils:
         return
     if levels:
@@ -369,7 +364,7 @@ def choose_plan(
         fastest: for "benchmark": chooses among a plan for every kernel that fits, see `kernel_benchmark`.
     """
     check_kernel(kernel)
-    _check_effects(values, kernel, levels)
+    _check_stencils(values, kernel, levels)
     scene = _PlanBuilder(values, dtype, progress)
     size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
     if levels:

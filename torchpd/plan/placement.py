@@ -102,6 +102,11 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=compiled.progress)
+    if values.poisson is not None:
+        raise RuntimeError(
+            f"Simulator: device must be the CPU for scenes with Poisson's ratio, which has no kernels for {device} yet; "
+            "keep it there, or leave poisson out"
+        )
     return choose_plan(
         values, dtype, properties_of(device), compiled.kernel,
         levels=isinstance(compiled.solver, Multilevel), batch=compiled.batch, progress=compiled.progress,

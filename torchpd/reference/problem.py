@@ -55,11 +55,6 @@ class StepProblem:
         return tuple(groups_of(self.values, self.positions, self.time_step))
 
     @cached_property
-    def joined(self) -> Mask:
-        """Whether an element joins the component to another one [components]."""
-        return joined_components(self.values)
-
-    @cached_property
     def plain_diagonal(self) -> Array:
         """D_i = a_i + sum_e w_e V_e |g_i|^2 [V]: the diagonal of A, N/m."""
         return self.weight + sum(group.plain_diagonal for group in self.groups)
@@ -270,18 +265,6 @@ def step_problem(
         sphere_centers=centers,
         sphere_motions=centers - starts,
     )
-
-
-def joined_components(values: SceneValues) -> Mask:
-    """Whether an element has corners in the component [components] and in another one.
-
-    Its energy would change with a rigid motion of the component.
-    """
-    joined = np.zeros(int(values.component.max()) + 1, dtype=np.bool_)
-    for stencils in values.stencils:
-        components = values.component[stencils.corners]
-        joined[components[(components != components[:, :1]).any(axis=1)]] = True
-    return joined
 
 
 def elastic_energy(values: SceneValues, positions: Array) -> float:

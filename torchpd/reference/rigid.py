@@ -73,7 +73,7 @@ def begin(problem: Problem, guess: Array, diagonal: Array) -> Array:
 def align(problem: Problem, displacement: Array, nearest_rotation: NearestRotation, *, first: bool = False) -> Array:
     """Displacements [V, 3] m after the rigid motion of every component; `first`: before any iteration."""
     values, moved = problem.values, displacement.copy()
-    for number in np.flatnonzero(~problem.joined):
+    for number in range(int(values.component.max()) + 1):
         of = values.component == number
         for _ in range(LEGS):
             component = RigidComponent(problem, moved, of, nearest_rotation, first)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..geometry.mesh_faces import match_faces
 from ..geometry.tet_mesh import TetMesh
 
-__all__ = ["average_over", "is_lattice"]
+__all__ = ["average_over", "check_signs", "is_lattice"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -30,6 +30,23 @@ def average_over(mesh: TetMesh, bulk_modulus: Array, size: int | None) -> Index:
     if size == 1:
         return np.arange(len(mesh.tets), dtype=np.int64)
     return _grown(_neighbours(mesh.tets, bulk_modulus), len(mesh.tets), size)
+
+
+def check_signs(name: str, poisson: Array, group: Index) -> None:
+    """Refuse groups with Poisson's ratios of both signs, whose mean has no majoriser; `poisson` is [E] or [B, E]."""
+    if not (poisson < 0.0).any():
+        return
+    count = int(group.max()) + 1
+    for row in poisson.reshape(-1, len(group)):
+        signs = (np.bincount(group[mask], minlength=count) for mask in (row < 0.0, row > 0.0))
+        both = np.flatnonzero(next(signs) * next(signs))
+        if both.size:
+            tets = np.flatnonzero(group == both[0])
+            raise ValueError(
+                f"{name} must have one sign in each group of averaged tetrahedra, got {row[tets].tolist()} in "
+                f"tetrahedra {tets.tolist()} ({both.size} groups in all); give Solid(averaging=) groups of one sign, "
+                "or 1"
+            )
 
 
 def is_lattice(mesh: TetMesh) -> bool:

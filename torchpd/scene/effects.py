@@ -159,6 +159,9 @@ def _poisson(value: ArrayLike, count: int) -> Array | float:
     return array
 
 
+_LARGEST_GROUP = 4  # of tetrahedra, see csrc/plan/mesh/elements.h
+
+
 def _averaging(value: Any, count: int) -> int | Index | None:
     name = "Solid.averaging"
     if value is None:
@@ -169,6 +172,12 @@ def _averaging(value: Any, count: int) -> int | Index | None:
     if array.ndim == 0:
         return int(array)
     check_shape(name, array, (count,), "the number of a group for each tetrahedron")
+    numbers, sizes = np.unique(array, return_counts=True)
+    if sizes.max() > _LARGEST_GROUP:
+        raise ValueError(
+            f"{name} must have up to {_LARGEST_GROUP} tetrahedra in a group, got {sizes.max()} in group "
+            f"{numbers[sizes.argmax()]}; divide it"
+        )
     return array.astype(np.int64)
 
 

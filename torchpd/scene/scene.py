@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..common.synonyms import check_arguments
 from ..geometry.mesh_faces import mesh_components
+from .averaging import check_signs
 from .cloth import Cloth
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .fibres import Fibres
@@ -226,12 +227,19 @@ class Scene:
         """Poisson's ratios of all tetrahedra and their groups, or None if every solid has the scalar 0."""
         if all(isinstance(solid.poisson, float) for solid in self.solids):
             return None, None
-        ratios, groups, count = [], [], 0
+        ratios = [np.broadcast_to(solid.poisson, len(solid.mesh.tets)) for solid in self.solids]
+        poisson, group = np.concatenate(ratios), self.averaging_groups
+        check_signs("Solid.poisson", poisson, group)
+        return poisson, group
+
+    @property
+    def averaging_groups(self) -> Index:
+        """Numbers of the groups of tetrahedra that share the mean of their volume strain [E]."""
+        groups, count = [np.zeros(0, dtype=np.int64)], 0
         for solid in self.solids:
-            ratios.append(np.broadcast_to(solid.poisson, len(solid.mesh.tets)))
             groups.append(solid.averaging_groups + count)
             count = int(groups[-1].max()) + 1
-        return np.concatenate(ratios), np.concatenate(groups)
+        return np.concatenate(groups)
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(type(part).__name__ for part in self.parts)})"

@@ -30,6 +30,7 @@ from ..plan.material import (
 )
 from ..plan.placement import plan_after_release, plan_for_solver
 from ..plan.preconditioner import has_outliers, has_preconditioner
+from ..scene.averaging import check_signs
 from ..scene.pins import PIN_HARD, split_springs
 from .parametrization import apply_parametrization, invert_parametrization, parametrization
 
@@ -95,6 +96,8 @@ def check_change(
                 f"{owner} copies the values of {name}, so gradients do not reach the tensor given. Detach it, or "
                 f'pass it per call: torch.func.functional_call(sim, {{"{name}": ...}}, (state,))'
             )
+    if "poisson" in checked:
+        check_signs(f"{owner}: poisson", checked["poisson"].cpu().double().numpy(), compiled.scene.averaging_groups)
     if replaces_hard:
         checked[PIN_HARD] = check_pin_hard(owner, hard, own[PIN_HARD])
     hard_of_springs = {PIN_HARD: checked["pin_stiffness"]} if "pin_stiffness" in checked else {}

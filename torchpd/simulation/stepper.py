@@ -236,9 +236,10 @@ class Stepper(Readable):
         refuse_forward_mode(positions)
         arrays = self.material_at(targets, positions.shape[0])
         material, elastic, plan = named_material(arrays), elastic_material(arrays), list(self.plan.arrays)
-        energy = cast(Tensor, _ops.element_energy(positions, elastic, plan)).sum(-1)
         if len(arrays) > len(CORE_ROWS):
-            energy = energy + _ops.effect_energy(positions, elastic, plan)
+            energy = cast(Tensor, _ops.effect_energy(positions, elastic, plan))
+        else:
+            energy = cast(Tensor, _ops.element_energy(positions, elastic, plan)).sum(-1)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
         energy = energy - (material["masses"] * weight).sum(-1)
         if len(self.plan.pin_vertex):

@@ -1,5 +1,6 @@
 // Runner of solver/adjoint/conjugate_gradients.h: one environment at a time, by one thread or by a team.
 #pragma once
+#include "cpu/adjoint/rotation_jacobians.h"
 #include "cpu/multilevel/v_cycle.h"
 #include "cpu/step/sweep.h"
 #include "solver/adjoint/friction.h"
@@ -9,43 +10,6 @@
 #include <memory>
 
 namespace pd::inline PD_TARGET {
-
-// The rotation Jacobian of every element: nine numbers of the rotation and nine of the inverse, in blocks of lanes.
-template <class T>
-class RotationJacobians {
-  static constexpr int W = native_width<T>, numbers = 18;
-
- public:
-  explicit RotationJacobians(const Plan<T>& plan)
-      : storage_(allocate_zeroed(std::int64_t(plan.blocks) * block_lanes * numbers * sizeof(T))),
-        data_(reinterpret_cast<T*>(storage_.get())) {}
-
-  void set(const BlockPart<T>& part, const RotationJacobian<Pack<T, W>>& jacobian) {
-    each(part, jacobian, [](auto& number, T* at) { number.store(at); });
-  }
-  RotationJacobian<Pack<T, W>> get(const BlockPart<T>& part) const {
-    RotationJacobian<Pack<T, W>> jacobian;
-    each(part, jacobian, [](auto& number, T* at) { number = Pack<T, W>::load(at); });
-    return jacobian;
-  }
-
- private:
-  template <class Any, class Visit>
-  void each(const BlockPart<T>& part, Any& jacobian, const Visit& visit) const {
-    T* at = data_ + std::int64_t(part.block) * block_lanes * numbers + part.first_lane;
-    for (auto* matrix : {&jacobian.rotation, &jacobian.inverse}) {
-      for (auto& row : matrix->row) {
-        for (auto* number : {&row.x, &row.y, &row.z}) {
-          visit(*number, at);
-          at += block_lanes;
-        }
-      }
-    }
-  }
-
-  Storage storage_;
-  T* data_;
-};
 
 // Vectors of BiCGStab: p, the first residual of a cycle, the correction of y, and the second product of an iteration.
 template <class T>
@@ -73,7 +37,9 @@ struct ConjugateMemory {
   FrictionVectors<T> friction;
 
   explicit ConjugateMemory(const ConjugateCall<T>& call)
-      : vectors(call), jacobians(call.plan), friction(call.friction ? call.plan.vertices : 0) {
+      : vectors(call),
+        jacobians(call.plan, call.effects.poisson.data != nullptr),
+        friction(call.friction ? call.plan.vertices : 0) {
     if (call.plan.levels.there()) cycle = std::make_unique<Cycle<Single<T>>>(call.plan.levels);
   }
 };
@@ -140,19 +106,13 @@ class ConjugatePass {
       w_.inverse[i] = call_.inverse.of(environment_)[plan_.vertex_order[i]];
     }
     const auto environment_of = [&](int) { return environment_; };
-    sweep_.set_weights(call_.stiffness, false, environment_of);
+    sweep_.set_weights(call_.stiffness, call_.effects, WeightKind::force, environment_of);
     sweep_.set_stencil_numbers(call_.effects, environment_of);
     team_.barrier();
     sweep_.set_origins();
     team_.barrier();
-    const auto differentiate = one_by_one([&](const auto& elements, int s) {
-      using R = typename std::remove_cvref_t<decltype(elements)>::R;
-      Vec3<R> x[4];
-      elements.corners(s, 0, x);
-      jacobians_.set(elements.part(s),
-                     RotationJacobian<R>(deformation_gradient(x, elements.rest(s))));
-    });
-    sweep_.run(0, Elements{differentiate, NoStencils{}}, [](std::int64_t, const Quad<T>&, Sum&) {});
+    sweep_.run(0, Elements{KeepJacobians<T>{jacobians_}, NoStencils{}},
+               [](std::int64_t, const Quad<T>&, Sum&) {});
   }
 
   void begin(Conjugate& numbers) {
@@ -173,15 +133,7 @@ class ConjugatePass {
   // visit(vertex, elastic Hessian times the direction, sums)
   template <class Visit>
   void multiply(const Visit& visit) {
-    const auto product = one_by_one([&](const auto& elements, int s) {
-      using R = typename std::remove_cvref_t<decltype(elements)>::R;
-      Vec3<R> dx[4], g[4];
-      elements.corners(s, 1, dx);
-      solid_hessian_product(jacobians_.get(elements.part(s)), dx, elements.rest(s),
-                            elements.weight(s), g);
-      elements.add(s, g);
-    });
-    sweep_.template run<2>(0, Elements{product, StencilHessian{}}, visit);
+    sweep_.template run<2>(0, Elements{JacobianProduct<T>{jacobians_}, StencilHessian{}}, visit);
   }
 
   void iterate(Conjugate& numbers) {

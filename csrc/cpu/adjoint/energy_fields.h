@@ -36,15 +36,13 @@ class FieldPass {
     } else if (call_.field == Field::effect_products) {
       differentiate_by_effects(environment);
     } else if (call_.field == Field::element_energy) {
-      element_field<1>(environment, [](const auto& x, const auto& rest, const auto& weight) {
-        using R = std::remove_cvref_t<decltype(weight)>;
-        const auto d = strain(x[0], rest);
-        return R(0.5) * weight * frobenius(d, d);
-      });
+      element_field<1, 1>(environment, ElementEnergy{});
+    } else if (call_.field == Field::element_energy_product) {
+      element_field<2, 1>(environment, ElementEnergyProduct{});
+    } else if (call_.direction) {
+      element_field<2, 2>(environment, LameProduct{});
     } else {
-      element_field<2>(environment, [](const auto& x, const auto& rest, const auto& weight) {
-        return element_energy_product(x[0], x[1], rest, weight);
-      });
+      element_field<1, 2>(environment, LameSlope{});
     }
     team_.barrier();
   }
@@ -63,7 +61,10 @@ class FieldPass {
       if (call_.direction) w_.before[i] = read(call_.direction, environment, i);
     }
     const auto environment_of = [&](int) { return environment; };
-    sweep_.set_weights(call_.stiffness, call_.weighted, environment_of);
+    const WeightKind kind = call_.field != Field::diagonal ? WeightKind::force
+                            : call_.weighted               ? WeightKind::majoriser
+                                                           : WeightKind::matrix;
+    sweep_.set_weights(call_.stiffness, call_.effects, kind, environment_of);
     sweep_.set_stencil_numbers(call_.effects, environment_of);
     team_.barrier();
     sweep_.set_origins();
@@ -79,9 +80,7 @@ class FieldPass {
   }
 
   void sum_energy(std::int64_t environment) {
-    const auto none = one_by_one([](const auto&, int) {});
-    sweep_.run(0, Elements{none, StencilGradient<true>{}},
-               [](std::int64_t, const Quad<T>&, Sum&) {});
+    sweep_.run(0, elastic_gradient<true>(), [](std::int64_t, const Quad<T>&, Sum&) {});
     if (team_.rank != 0) return;
     double sum = 0;
     for (int part = 0; part < w_.part_count; ++part) sum += w_.parts[0][part].energy;
@@ -93,9 +92,9 @@ class FieldPass {
     for (int k = 0; plan_.stencil_blocks && k < int(KindNumber::count); ++k)
       elements += plan_.stencil_sizes[stencil_size_count + k];
     T* const out = call_.out + environment * elements;
-    const T* const stiffness = call_.stiffness.of(environment);
+    const MatrixStiffness<T> stiffness(call_.stiffness, call_.effects, environment);
     for (std::int64_t t = team_.begin(plan_.tets); t < team_.end(plan_.tets); ++t)
-      out[t] = stiffness[t];
+      out[t] = stiffness(t);
     each_stencil_stiffness(plan_, call_.effects, environment, team_.begin(plan_.stencil_blocks),
                            team_.end(plan_.stencil_blocks),
                            [&](T w, std::int64_t n) { out[n] = w; });
@@ -103,6 +102,7 @@ class FieldPass {
 
   // Each stencil writes to its own row.
   void differentiate_by_effects(std::int64_t environment) {
+    if (plan_.stencil_blocks == 0) return;
     for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
       call_.direction ? sweep_.template gather_slots<2>(patch)
                       : sweep_.template gather_slots<1>(patch);
@@ -138,36 +138,59 @@ class FieldPass {
     }
   }
 
-  template <int Fields, class Element>
-  void element_field(std::int64_t environment, Element element) {
-    constexpr int W = native_width<T>;
+  // Numbers of every element: `Numbers` a lane, from element.run<N>(elements, write).
+  template <int Fields, int Numbers, class Element>
+  void element_field(std::int64_t environment, const Element& element) {
     for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
       sweep_.template gather_slots<Fields>(patch);
-      const Quad<T>* const fields[2] = {scratch_.x, scratch_.direction};
-      for (int block = plan_.patch_block[patch]; block < plan_.patch_block[patch + 1]; ++block) {
-        for (int first = 0; first < block_lanes; first += W) {
-          write_lanes<Fields>(environment, {&plan_, block, first}, fields, element);
-        }
-      }
+      const Quad<T>* fields[Fields];
+      fields[0] = scratch_.x;
+      if constexpr (Fields == 2) fields[1] = scratch_.direction;
+      const auto& corners = const_cast<const Quad<T>* const(&)[Fields]>(fields);
+      with_members(w_.pressure ? plan_.members : 0, [&]<int Members>() {
+        LaneSums<Lanes> unused;
+        const auto write = [&](const auto& elements, int s, const auto&... number) {
+          write_lanes<Numbers>(environment, elements.part(s), {number...});
+        };
+        each_element(plan_, patch,
+                     ElementsAcross<Fields, T, Members>(plan_, corners, w_.weights(), nullptr,
+                                                        unused),
+                     Written<Element, decltype(write)>{element, write});
+      });
     }
   }
 
-  template <int Fields, class Element>
-  void write_lanes(std::int64_t environment, BlockPart<T> part, const Quad<T>* const (&field)[2],
-                   Element& element) {
-    constexpr int W = native_width<T>;
-    using R = Pack<T, W>;
-    Vec3<R> corner[Fields][4];
-    for (int f = 0; f < Fields; ++f) {
-      for (int c = 0; c < 4; ++c) corner[f][c] = gather_corner<T, W>(field[f], part.corner(c));
+  // Passes the numbers of an element field on.
+  template <class Element, class Write>
+  struct Written {
+    static constexpr int strip = 1;
+    const Element& element;
+    const Write& write;
+
+    template <int N, class Elements>
+    PD_HD void run(const Elements& elements) const {
+      element.template run<N>(elements, write);
     }
-    const auto rest = read_rest<R>([&](int number) { return R::load(part.rest(number)); });
-    const R value = element(corner, rest, R::load(w_.weight + part.element()));
-    for (int lane = 0; lane < W; ++lane) {
+  };
+
+  template <int Numbers>
+  void write_lanes(std::int64_t environment, const BlockPart<T>& part,
+                   const Pack<T, native_width<T>> (&number)[Numbers]) {
+    for (int lane = 0; lane < native_width<T>; ++lane) {
+      const std::int64_t e = part.element() + lane;
       // padding repeats an element of the patch with zero volume: it must not write
-      if (plan_.tet_volume[part.element() + lane] == T(0)) continue;
-      call_.out[environment * plan_.tets + plan_.tet_order[part.element() + lane]] = value.v[lane];
+      if (plan_.tet_volume[e] == T(0)) continue;
+      T* to = call_.out + (environment * plan_.tets + plan_.tet_order[e]) * Numbers;
+      for (int n = 0; n < Numbers; ++n) to[n] = number[n].v[lane];
+      if constexpr (Numbers == 2) to_parameters(environment, e, to);
     }
+  }
+
+  // By E and nu, from slopes by V 2 mu and V lambda.
+  void to_parameters(std::int64_t environment, std::int64_t e, T* slope) const {
+    const int32 t = plan_.tet_order[e];
+    const LameSlopes<T> by(call_.stiffness.of(environment)[t], call_.effects.poisson.of(environment)[t]);
+    by.chain(plan_.tet_volume[e], slope);
   }
 
   const FieldCall<T>& call_;

@@ -34,7 +34,7 @@ template <class T>
 class TurningElements {
  public:
   // `memory`: three times the most slots of a patch
-  TurningElements(const Plan<T>& plan, const T* weights, Quad<T>* memory)
+  TurningElements(const Plan<T>& plan, const ElementWeights<T>& weights, Quad<T>* memory)
       : plan_(plan),
         weights_(weights),
         position_(memory),
@@ -58,7 +58,7 @@ class TurningElements {
     const Quad<T>* const fields[3] = {position_, first_, last_};
     LaneSums<Single<T>> unused;
     const Vec3<R> to_middle = {R(shift.x), R(shift.y), R(shift.z)};
-    const ElementsAcross<3, T> elements(plan_, fields, weights_, false, nullptr, unused);
+    const ElementsAcross<3, T> elements(plan_, fields, weights_, nullptr, unused);
     each_element(plan_, patch, elements,
                  one_by_one([&](const auto& pack, int s) { add_pack(pack, s, to_middle, sum); }));
     for (int p = 0; p < turning_pairs; ++p) {
@@ -87,44 +87,49 @@ class TurningElements {
       present[k] = any((weight[0] + weight[1]) + (weight[2] + weight[3]) > R(T(0)));
       if (present[k]) strain[k] = TurningStrain<R>(TurningGradient<R>(inverse, back, x, weight));
     }
-    add_strains(strain, present, elements.weight(s), sum);
+    if (elements.weights.pressure) {
+      add_strains<true>(strain, present, elements.weight(s), elements.pressure(s), sum);
+    } else {
+      add_strains<false>(strain, present, elements.weight(s), R(T(0)), sum);
+    }
   }
 
   // Groups with groups before them, and the modes of each where they meet: of six numbers half are none. The order of pairs is
   // that of `turning_pair`. A pack of elements seldom has all groups; the others would add zeros.
-  template <class R>
+  template <bool Dilates, class R>
   static void add_strains(const TurningStrain<R> (&strain)[turning_groups],
                           const bool (&present)[turning_groups], const R& weight,
-                          R (&sum)[turning_pairs]) {
+                          const R& pressure, R (&sum)[turning_pairs]) {
     for (int k = 0; k < turning_groups; ++k) {
       if (!present[k]) continue;
       R own[6][6];
       for (int i = 0; i < 6; ++i) {
         for (int c = 0; c < 6; ++c) own[i][c] = weight * strain[k].h[i][c];
+        if (Dilates) add_dilation(strain[k].h[i], pressure, own[i]);
       }
       for (int l = 0; l < k; ++l) {
         if (!present[l]) continue;
         R* to = sum + turning_pair(6 * k, 6 * l);
-        add_group<false>(own, strain[l].h, to);
+        add_group<false, Dilates>(own, strain[l].h, to);
       }
-      add_group<true>(own, strain[k].h, sum + turning_pair(6 * k, 6 * k));
+      add_group<true, Dilates>(own, strain[k].h, sum + turning_pair(6 * k, 6 * k));
     }
   }
 
-  template <bool Same, class R>
+  template <bool Same, bool Dilates, class R>
   static void add_group(const R (&own)[6][6], const R (&other)[6][6], R* sum) {
     PD_UNROLL
     for (int i = 0; i < 6; ++i) {
       PD_UNROLL
       for (int j = 0; j < (Same ? i + 1 : 6); ++j) {
         R& to = sum[Same ? i * (i + 1) / 2 + j : 6 * i + j];
-        add_strain_product(own[i], i, other[j], j, to);
+        add_strain_product<Dilates>(own[i], i, other[j], j, to);
       }
     }
   }
 
   const Plan<T>& plan_;
-  const T* weights_;
+  ElementWeights<T> weights_;
   Quad<T>*position_, *first_, *last_;
 };
 
@@ -269,9 +274,15 @@ class CorotationMaker {
     const std::int64_t elements = std::int64_t(plan_.blocks) * block_lanes;
     const int lanes = w_.shared_weight ? 1 : width;
     // then the team is one thread
-    for (std::int64_t e = 0; lanes > 1 && e < elements; ++e)
-      shared_.weights[e] = w_.weight[e * lanes + lane];
-    TurningElements<T> work(plan_, lanes > 1 ? shared_.weights.begin() : w_.weight,
+    ElementWeights<T> weights = w_.weights();
+    if (lanes > 1) {
+      T *weight = shared_.weights.begin(), *pressure = weight + elements;
+      for (std::int64_t e = 0; e < elements; ++e) weight[e] = w_.weight[e * lanes + lane];
+      for (std::int64_t e = 0; w_.pressure && e < elements; ++e)
+        pressure[e] = w_.pressure[e * lanes + lane];
+      weights = {weight, w_.pressure ? pressure : nullptr, true};
+    }
+    TurningElements<T> work(plan_, weights,
                             &shared_.slots[std::size_t(team_.rank) * 3 * plan_.most_slots]);
     for (std::int64_t patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches);
          ++patch) {

@@ -60,9 +60,9 @@ struct CorotationWork {
   Row<Unheld> unheld;                              // [environments]; none without contacts
   Row<std::array<double, turning_pairs>> springs;  // [chunks]; none without contacts
   Row<Quad<T>> slots;                              // [threads, 3, most slots of a patch]
-  Row<T> weights;  // [elements] of one environment, where they differ
+  Row<T> weights;  // [elements] of one environment, where they differ; twice with Poisson's ratio
 
-  CorotationWork(const Plan<T>& plan, bool wanted, bool touching, int threads)
+  CorotationWork(const Plan<T>& plan, bool wanted, bool touching, bool poisson, int threads)
       : chunks(wanted ? (plan.vertices + chunk - 1) / chunk : 0),
         numbers(wanted ? plan.vertices : 0),
         images(wanted ? plan.vertices : 0),
@@ -73,7 +73,8 @@ struct CorotationWork {
         unheld(wanted && touching ? width : 0),
         springs(touching ? chunks : 0),
         slots(wanted ? std::size_t(threads) * 3 * plan.most_slots : 0),
-        weights(wanted && width > 1 ? std::size_t(plan.blocks) * block_lanes : 0) {}
+        weights(wanted && width > 1 ? std::size_t(plan.blocks) * block_lanes * (poisson ? 2 : 1)
+                                    : 0) {}
 
   static double number(const Real& of, int lane) { return Lanes::lane(Lanes::widen(of), lane); }
 

@@ -1,6 +1,7 @@
 // Runner of measure_mismatch (solver/multilevel/material_mismatch.h) on the CPU.
 #pragma once
 #include "cpu/step/stencil_blocks.h"
+#include "elements/lame.h"
 #include "solver/multilevel/material_mismatch.h"
 #include "threads/team.h"
 
@@ -19,9 +20,9 @@ struct MismatchRunner {
 
   template <class Visit>
   void each_element(const Visit& visit) const {
-    const T* stiffness = call.material.stiffness.of(environment);
+    const MatrixStiffness<T> stiffness(call.material.stiffness, call.effects, environment);
     for (std::int64_t t = team.begin(plan.tets); t < team.end(plan.tets); ++t)
-      visit(stiffness[t], t);
+      visit(stiffness(t), t);
     each_stencil_stiffness(plan, call.effects, environment, team.begin(plan.stencil_blocks),
                            team.end(plan.stencil_blocks), visit);
   }

@@ -169,26 +169,58 @@ struct LaneSums<Batch<T, W>> {
   }
 };
 
+// The place of pack number n of a plan, of `parts` packs a block. Groups of elements with Poisson's ratio have one
+// lane of `Members` blocks each, one after another; their packs follow one another. 0: elements without.
+template <int Members, int parts>
+struct PackPlace {
+  static constexpr int members = Members > 1 ? Members : 1;
+  int block, part;
+
+  PD_HD explicit PackPlace(int n)
+      : block(n / members / parts * members + n % members), part(n / members % parts) {}
+};
+
+// Weights of the elements of a plan: w V, and V lambda where they have Poisson's ratio; see Workspace.
+template <class T>
+struct ElementWeights {
+  const T *weight, *pressure;
+  bool shared;  // by the environments of a batch
+};
+
+// Forces of a group's packs until all of them are known; nothing without groups.
+template <int Members, class T, int W>
+struct GroupForces {
+  Quad<T> quads[Members][4][W];
+};
+template <int Members, class T, int W>
+  requires(Members < 2)
+struct GroupForces<Members, T, W> {};
+
 // The packs of elements that a functor works on at once, counted by `s`: elements of one environment across lanes.
-template <int Fields, class T>
+template <int Fields, class T, int Members = 0>
 struct ElementsAcross {
-  static constexpr int W = native_width<T>, parts = block_lanes / W;
+  static constexpr int W = native_width<T>, parts = block_lanes / W, members = Members;
   using R = Pack<T, W>;
 
   const Plan<T>& plan;
   const Quad<T>* const (&field)[Fields];
-  const T* weights;
+  ElementWeights<T> weights;
   Quad<T>* forces;
   LaneSums<Single<T>>& sums;
   int first;  // pack, from the first block of the plan
+  [[no_unique_address]] mutable GroupForces<Members, T, W> kept;
 
-  ElementsAcross(const Plan<T>& p, const Quad<T>* const (&f)[Fields], const T* w, bool, Quad<T>* g,
-                 LaneSums<Single<T>>& all)
+  ElementsAcross(const Plan<T>& p, const Quad<T>* const (&f)[Fields], const ElementWeights<T>& w,
+                 Quad<T>* g, LaneSums<Single<T>>& all)
       : plan(p), field(f), weights(w), forces(g), sums(all), first(0) {}
 
   static int packs(int blocks) { return blocks * parts; }
+  PD_HD PackPlace<Members, parts> place(int s) const {
+    return PackPlace<Members, parts>(first + s);
+  }
   PD_HD BlockPart<T> part(int s) const {
-    return {&plan, (first + s) / parts, (first + s) % parts * W};
+    const auto at = place(s);
+    return {&plan, at.block, at.part * W};
   }
   PD_HD void corners(int s, int f, Vec3<R> (&x)[4]) const {
     for (int c = 0; c < 4; ++c) x[c] = gather_corner<T, W>(field[f], part(s).corner(c));
@@ -196,31 +228,57 @@ struct ElementsAcross {
   PD_HD FaceRest<R, 1> rest(int s) const {
     return read_rest<R>([&](int number) { return R::load(part(s).rest(number)); });
   }
-  PD_HD R weight(int s) const { return R::load(weights + part(s).element()); }
-  PD_HD R& sum(int s) const { return sums.part[(first + s) % parts]; }
-  PD_HD void add(int s, const Vec3<R> (&g)[4]) const { scatter_corners<T, W>(forces, part(s), g); }
+  PD_HD R weight(int s) const { return R::load(weights.weight + part(s).element()); }
+  PD_HD R pressure(int s) const { return R::load(weights.pressure + part(s).element()); }
+  PD_HD R& sum(int s) const { return sums.part[place(s).part]; }
+  PD_HD void add(int s, const Vec3<R> (&g)[4]) const {
+    if constexpr (Members > 1) {
+      const int member = s % Members;
+      for (int c = 0; c < 4; ++c) store_quads<T, W>(g[c], kept.quads[member][c]);
+      if (member == Members - 1) add_group(s - member);
+    } else {
+      scatter_corners<T, W>(forces, part(s), g);
+    }
+  }
+
+ private:
+  // Group after group, member after member: the order of a batch.
+  PD_HD void add_group(int s) const {
+    for (int lane = 0; lane < W; ++lane) {
+      for (int m = 0; m < Members; ++m) {
+        for (int c = 0; c < 4; ++c) {
+          Quad<T>& to = forces[part(s + m).corner(c)[lane]];
+          to = to + kept.quads[m][c][lane];
+        }
+      }
+    }
+  }
 };
 
 // The same for one element of W environments across lanes.
-template <int Fields, class T, int W>
+template <int Fields, class T, int W, int Members = 0>
 struct EnvironmentsAcross {
+  static constexpr int members = Members;
   using R = Pack<T, W>;
 
   const Plan<T>& plan;
   const Vec3<R>* const (&field)[Fields];
-  const T* weights;
-  bool shared_weight;
+  ElementWeights<T> weights;
   Vec3<R>* forces;
   LaneSums<Batch<T, W>>& sums;
   int first;  // element, padding counted
 
-  EnvironmentsAcross(const Plan<T>& p, const Vec3<R>* const (&f)[Fields], const T* w, bool shared,
-                     Vec3<R>* g, LaneSums<Batch<T, W>>& all)
-      : plan(p), field(f), weights(w), shared_weight(shared), forces(g), sums(all), first(0) {}
+  EnvironmentsAcross(const Plan<T>& p, const Vec3<R>* const (&f)[Fields],
+                     const ElementWeights<T>& w, Vec3<R>* g, LaneSums<Batch<T, W>>& all)
+      : plan(p), field(f), weights(w), forces(g), sums(all), first(0) {}
 
   static int packs(int blocks) { return blocks * block_lanes; }
+  PD_HD PackPlace<Members, block_lanes> place(int s) const {
+    return PackPlace<Members, block_lanes>(first + s);
+  }
   PD_HD BlockPart<T> part(int s) const {
-    return {&plan, (first + s) / block_lanes, (first + s) % block_lanes};
+    const auto at = place(s);
+    return {&plan, at.block, at.part};
   }
   PD_HD void corners(int s, int f, Vec3<R> (&x)[4]) const {
     for (int c = 0; c < 4; ++c) x[c] = field[f][*part(s).corner(c)];
@@ -228,36 +286,55 @@ struct EnvironmentsAcross {
   PD_HD FaceRest<R, 1> rest(int s) const {
     return read_rest<R>([&](int number) { return R(*part(s).rest(number)); });
   }
-  PD_HD R weight(int s) const {
+  PD_HD R weight(int s) const { return load(weights.weight, s); }
+  PD_HD R pressure(int s) const { return load(weights.pressure, s); }
+  PD_HD R load(const T* from, int s) const {
     const std::int64_t e = part(s).element();
-    return shared_weight ? R(weights[e]) : R::load(weights + e * W);
+    return weights.shared ? R(from[e]) : R::load(from + e * W);
   }
-  PD_HD R& sum(int s) const { return sums.part[(first + s) % block_lanes]; }
+  PD_HD R& sum(int s) const { return sums.part[place(s).part]; }
   PD_HD void add(int s, const Vec3<R> (&g)[4]) const {
     for (int c = 0; c < 4; ++c) forces[*part(s).corner(c)] = forces[*part(s).corner(c)] + g[c];
   }
 };
 
-template <int Fields, class Lanes>
+template <int Fields, class Lanes, int Members>
 struct ElementsOf;
-template <int Fields, class T>
-struct ElementsOf<Fields, Single<T>> {
-  using type = ElementsAcross<Fields, T>;
+template <int Fields, class T, int Members>
+struct ElementsOf<Fields, Single<T>, Members> {
+  using type = ElementsAcross<Fields, T, Members>;
 };
-template <int Fields, class T, int W>
-struct ElementsOf<Fields, Batch<T, W>> {
-  using type = EnvironmentsAcross<Fields, T, W>;
+template <int Fields, class T, int W, int Members>
+struct ElementsOf<Fields, Batch<T, W>, Members> {
+  using type = EnvironmentsAcross<Fields, T, W, Members>;
 };
 
-// Calls element.run<N>(elements) on every pack of elements of a patch, Element::strip at a time.
+// Calls element.run<N>(elements) on every pack of elements of a patch, Element::strip at a time but whole groups.
 template <class T, class Elements, class Element>
 PD_HD void each_element(const Plan<T>& plan, int patch, Elements elements, const Element& element) {
+  constexpr int least = Elements::members > 1 ? Elements::members : 1;
+  constexpr int strip = Element::strip > least ? Element::strip : least;
   const int end = Elements::packs(plan.patch_block[patch + 1]);
   elements.first = Elements::packs(plan.patch_block[patch]);
-  for (; elements.first + Element::strip <= end; elements.first += Element::strip) {
-    element.template run<Element::strip>(elements);
+  for (; elements.first + strip <= end; elements.first += strip) {
+    element.template run<strip>(elements);
   }
-  for (; elements.first < end; ++elements.first) element.template run<1>(elements);
+  for (; elements.first < end; elements.first += least) element.template run<least>(elements);
+}
+
+// Calls visit.operator()<Members>() for the members of a group that a plan has; 0: elements without Poisson's ratio.
+template <class Visit>
+PD_HD void with_members(int members, const Visit& visit) {
+  switch (members) {
+    case 0:
+      return visit.template operator()<0>();
+    case 1:
+      return visit.template operator()<1>();
+    case 2:
+      return visit.template operator()<2>();
+    default:
+      return visit.template operator()<4>();
+  }
 }
 
 // Wraps a functor of one pack of elements, element(elements, s).

@@ -215,7 +215,10 @@ class Stepper {
         w_.inertia[i] = held_inertia(w_.inertia[i] + spring, spring);
       });
     const auto environment_of = [&](int lane) { return in_.environment(lane); };
-    sweep_.set_weights(call_.material.stiffness, set_.weighted, environment_of);
+    const auto set_weights = [&](WeightKind kind) {
+      sweep_.set_weights(call_.material.stiffness, call_.effects, kind, environment_of);
+    };
+    set_weights(set_.weighted ? WeightKind::majoriser : WeightKind::matrix);
     sweep_.set_stencil_numbers(call_.effects, environment_of);
     team_.barrier();
     const Elements<SolidDiagonal, StencilDiagonal> diagonal{{}, {set_.weighted}};
@@ -229,7 +232,7 @@ class Stepper {
     for (int part = 0; part < w_.part_count; ++part) least = lesser(least, w_.parts[0][part].least);
     for (int lane = 0; lane < width; ++lane) least_[lane] = Lanes::lane(Lanes::widen(least), lane);
     team_.barrier();
-    sweep_.set_weights(call_.material.stiffness, false, environment_of);
+    set_weights(WeightKind::force);
     team_.barrier();
   }
 

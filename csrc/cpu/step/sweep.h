@@ -98,18 +98,16 @@ struct Sweep {
     team.barrier();
   }
 
-  // Numbers of a step of every element: w V of tetrahedra, times l_e when `bounded`, and those of the stencils.
+  // Numbers of a step of every element: the weights of tetrahedra, and those of the stencils.
   // `environment_of(lane)`: the environment whose material a lane has
   template <class EnvironmentOf>
-  void set_weights(const Values<T>& stiffness, bool bounded, const EnvironmentOf& environment_of) {
+  void set_weights(const Values<T>& stiffness, const Effects<T>& effects, WeightKind kind,
+                   const EnvironmentOf& environment_of) {
     const int lanes = work.shared_weight ? 1 : Lanes::environments;
     const std::int64_t elements = std::int64_t(plan.blocks) * block_lanes;
     for (std::int64_t e = team.begin(elements); e < team.end(elements); ++e) {
-      const T volume = plan.tet_volume[e] * (bounded ? plan.tet_bound[e] : T(1));
-      for (int lane = 0; lane < lanes; ++lane) {
-        work.weight[e * lanes + lane] =
-            volume * stiffness.of(environment_of(lane))[plan.tet_order[e]];
-      }
+      for (int lane = 0; lane < lanes; ++lane)
+        work.set_weight(plan, stiffness, effects, environment_of(lane), e, e * lanes + lane, kind);
     }
   }
 
@@ -168,15 +166,28 @@ struct Sweep {
     fields[0] = scratch.x;
     if constexpr (Fields == 2) fields[1] = scratch.direction;
     const auto& corners = const_cast<const Value* const(&)[Fields]>(fields);
-    using Tets = typename ElementsOf<Fields, Lanes>::type;
-    each_element(plan, patch,
-                 Tets(plan, corners, work.weight, work.shared_weight, scratch.force, lanes),
-                 element.solid);
+    if (work.pressure) {
+      groups_of<Fields>(patch, corners, lanes, element.solid);
+    } else {
+      using Tets = typename ElementsOf<Fields, Lanes, 0>::type;
+      each_element(plan, patch, Tets(plan, corners, work.weights(), scratch.force, lanes),
+                   element.solid);
+    }
     if (plan.stencil_blocks == 0) return;
     each_stencil<Lanes>(plan, patch, [&](auto kind, const StencilPart<T>& part) {
       using Kind = decltype(kind);
       element.stencil.template run<Kind>(StencilsAcross<Kind, Fields, Lanes>{
           part, corners, work.numbers, work.shared_weight, scratch.force, lanes});
+    });
+  }
+
+  // Tetrahedra with Poisson's ratio: apart, so that the loops without it stay as they are.
+  template <int Fields, class Solid>
+  [[gnu::noinline]] void groups_of(int patch, const Value* const (&corners)[Fields],
+                                   LaneSums<Lanes>& lanes, const Solid& solid) {
+    with_members(plan.members, [&]<int Members>() {
+      using Tets = typename ElementsOf<Fields, Lanes, Members>::type;
+      each_element(plan, patch, Tets(plan, corners, work.weights(), scratch.force, lanes), solid);
     });
   }
 

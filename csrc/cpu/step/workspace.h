@@ -1,7 +1,8 @@
 // Memory of one running step: the state of one environment, or of W side by side.
 #pragma once
 #include "contact/plane_sphere.h"
-#include "cpu/step/lanes.h"
+#include "cpu/step/element_blocks.h"
+#include "elements/lame.h"
 #include "solver/rigid/rolling_contact.h"
 
 #include <cstdint>
@@ -31,6 +32,9 @@ struct ComponentSums {
   bool tips, still;  // in some environment
 };
 
+// What the weights of tetrahedra are for: forces, the diagonal that cannot diverge, or the plain one.
+enum class WeightKind { force, majoriser, matrix };
+
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers
 
 template <class Lanes>
@@ -59,30 +63,55 @@ struct Workspace {
   TippingSearch<Real>* search;  // [components]
   Plane<Real>* planes;
   Sphere<Real>* spheres;
-  T* weight;   // [elements], or [elements, W] when stiffness differs between environments
+  // [elements], or [elements, W] when stiffness differs between environments: w V, where w is Young's modulus, or 2 mu
+  // with Poisson's ratio; and then V lambda, else null
+  T *weight, *pressure;
   T* numbers;  // the same of stencils: [rows of 16 numbers of a step]
   int part_count;
   bool shared_weight;
   bool some_go_on = false;  // some environment moves in the next leg
 
   explicit Workspace(const StepCall<T>& call)
-      : Workspace(call.plan, call.material,
+      : Workspace(call.plan, call.material, call.effects,
                   call.material.stiffness.stride == 0 && shares_effects(call.effects),
                   call.forces != nullptr) {}
 
-  explicit Workspace(const FieldCall<T>& call) : Workspace(call.plan, {}, true, false) {}
+  explicit Workspace(const FieldCall<T>& call)
+      : Workspace(call.plan, {}, call.effects, true, false) {}
 
-  explicit Workspace(const ConjugateCall<T>& call) : Workspace(call.plan, {}, true, true) {}
+  explicit Workspace(const ConjugateCall<T>& call)
+      : Workspace(call.plan, {}, call.effects, true, true) {}
+
+  ElementWeights<T> weights() const { return {weight, pressure, shared_weight}; }
+
+  // Sets the weights of lane `e` of the plan's blocks, at place `at`, to those of an environment.
+  void set_weight(const Plan<T>& plan, const Values<T>& stiffness, const Effects<T>& effects,
+                  std::int64_t environment, std::int64_t e, std::int64_t at,
+                  WeightKind kind) const {
+    const T youngs = stiffness.of(environment)[plan.tet_order[e]], volume = plan.tet_volume[e];
+    const T bound = kind == WeightKind::majoriser ? plan.tet_bound[e] : T(1);
+    if (!pressure) {
+      weight[at] = (volume * bound) * youngs;
+      return;
+    }
+    const Lame<T> lame(youngs, effects.poisson.of(environment)[plan.tet_order[e]]);
+    weight[at] = volume * (kind == WeightKind::majoriser ? lame.majoriser(bound)
+                           : kind == WeightKind::matrix  ? lame.matrix()
+                                                         : lame.twice_mu);
+    pressure[at] = volume * lame.lambda;
+  }
 
  private:
   static constexpr std::size_t alignment = 64;
 
-  Workspace(const Plan<T>& plan, const Material<T>& material, bool same_stiffness, bool forces) {
+  Workspace(const Plan<T>& plan, const Material<T>& material, const Effects<T>& effects,
+            bool same_stiffness, bool forces) {
+    const bool has_pressure = effects.poisson.data != nullptr;
     shared_weight = Lanes::environments == 1 || same_stiffness;
     part_count = plan.patches + (plan.shared + shared_chunk - 1) / shared_chunk;
-    arrange(plan, material, forces, nullptr);
+    arrange(plan, material, has_pressure, forces, nullptr);
     storage_ = allocate_zeroed(size_);
-    arrange(plan, material, forces, storage_.get());
+    arrange(plan, material, has_pressure, forces, storage_.get());
   }
 
   template <class Item>
@@ -91,7 +120,8 @@ struct Workspace {
     size_ += (count * sizeof(Item) + alignment - 1) / alignment * alignment;
   }
 
-  void arrange(const Plan<T>& plan, const Material<T>& material, bool forces, std::byte* base) {
+  void arrange(const Plan<T>& plan, const Material<T>& material, bool has_pressure, bool forces,
+               std::byte* base) {
     size_ = 0;
     for (Value** array : {&x, &velocity, &target, &u, &before}) place(*array, plan.vertices, base);
     place(force, forces ? plan.vertices : 0, base);
@@ -109,9 +139,11 @@ struct Workspace {
     place(goes_on, plan.components * Lanes::environments, base);
     place(planes, material.planes_count, base);
     place(spheres, material.spheres_count, base);
-    place(weight,
-          std::int64_t(plan.blocks) * block_lanes * (shared_weight ? 1 : Lanes::environments),
-          base);
+    const std::int64_t weights =
+        std::int64_t(plan.blocks) * block_lanes * (shared_weight ? 1 : Lanes::environments);
+    place(weight, weights, base);
+    place(pressure, has_pressure ? weights : 0, base);
+    if (!has_pressure) pressure = nullptr;
     place(numbers,
           std::int64_t(plan.stencil_numbers) * block_lanes *
               (shared_weight ? 1 : Lanes::environments),

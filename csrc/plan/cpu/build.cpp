@@ -5,6 +5,8 @@
 #include "plan/mesh/stencils.h"
 
 #include <algorithm>
+#include <limits>
+#include <stdexcept>
 
 namespace pd {
 
@@ -29,32 +31,44 @@ void add_slots(MeshPlan& plan, const Numbering& n, const MeshElements& elements,
     }
   }
   plan.patch_slot.push_back(std::int32_t(plan.slot_vertex.size()));
+  if (plan.slot_vertex.size() - begin > std::numeric_limits<std::int16_t>::max())
+    throw std::invalid_argument("a patch has more vertices than 16 bits count: give a smaller patch_size");
 }
 
-// Blocks of tetrahedra of one patch. Neighbours go to different blocks, so that lanes of a block rarely add to the same vertex.
+// One lane of a block of tetrahedra.
+void set_lane(MeshPlan& plan, std::size_t block, int lane, const MeshElements& elements,
+              std::int32_t t, bool padding, const std::vector<std::int32_t>& slot_of) {
+  const double* x = elements.positions;
+  const std::int64_t* corner = elements.tets + 4 * std::int64_t(t);
+  const Rest rest = rest_of(x, {corner[0], corner[1], corner[2], corner[3]});
+  const auto face = face_rest<4>(x, {corner[0], corner[1], corner[2], corner[3]});
+  plan.tet_order[block * lanes + lane] = t;
+  plan.tet_volume[block * lanes + lane] = padding ? 0 : rest.volume;
+  plan.tet_bound[block * lanes + lane] = rest.bound;
+  for (int n = 0; n < 6; ++n) plan.tet_rest[(block * 6 + n) * lanes + lane] = face[n];
+  for (int k = 0; k < 4; ++k)
+    plan.tet_corner[(block * 4 + k) * lanes + lane] = std::int16_t(slot_of[corner[k]]);
+}
+
+// Blocks of tetrahedra of one patch: the members of a group have one lane of as many blocks. Neighbours go to different
+// blocks, so that lanes of a block rarely add to the same vertex.
 void add_blocks(MeshPlan& plan, const MeshElements& elements, std::span<const std::int32_t> patch,
                 const std::vector<std::int32_t>& slot_of) {
-  const double* x = elements.positions;
   const std::int64_t count = std::ssize(patch), blocks = (count + lanes - 1) / lanes;
   for (std::int64_t b = 0; b < blocks; ++b) {
-    const std::size_t block = plan.tet_order.size() / lanes;
-    plan.tet_order.resize((block + 1) * lanes);
-    plan.tet_volume.resize((block + 1) * lanes);
-    plan.tet_bound.resize((block + 1) * lanes);
-    plan.tet_rest.resize((block + 1) * 6 * lanes);
-    plan.tet_corner.resize((block + 1) * 4 * lanes);
-    for (int lane = 0; lane < lanes; ++lane) {
-      const std::int64_t i = lane * blocks + b;
-      const std::int32_t t = patch[std::min(i, count - 1)];
-      const std::int64_t* corner = elements.tets + 4 * std::int64_t(t);
-      const Rest rest = rest_of(x, {corner[0], corner[1], corner[2], corner[3]});
-      const auto face = face_rest<4>(x, {corner[0], corner[1], corner[2], corner[3]});
-      plan.tet_order[block * lanes + lane] = t;
-      plan.tet_volume[block * lanes + lane] = i < count ? rest.volume : 0;
-      plan.tet_bound[block * lanes + lane] = rest.bound;
-      for (int n = 0; n < 6; ++n) plan.tet_rest[(block * 6 + n) * lanes + lane] = face[n];
-      for (int k = 0; k < 4; ++k) {
-        plan.tet_corner[(block * 4 + k) * lanes + lane] = std::int16_t(slot_of[corner[k]]);
+    for (int member = 0; member < elements.averaged.members; ++member) {
+      const std::size_t block = plan.tet_order.size() / lanes;
+      plan.tet_order.resize((block + 1) * lanes);
+      plan.tet_volume.resize((block + 1) * lanes);
+      plan.tet_bound.resize((block + 1) * lanes);
+      plan.tet_rest.resize((block + 1) * 6 * lanes);
+      plan.tet_corner.resize((block + 1) * 4 * lanes);
+      for (int lane = 0; lane < lanes; ++lane) {
+        const std::int64_t i = lane * blocks + b;
+        const std::int32_t e = patch[std::min(i, count - 1)];
+        const int last = elements.members(e) - 1;
+        set_lane(plan, block, lane, elements, elements.member(e, std::min(member, last)),
+                 i >= count || member > last, slot_of);
       }
     }
   }
@@ -101,7 +115,7 @@ void add_elements(MeshPlan& plan, const MeshElements& elements, std::span<const 
   const auto before = [&](std::int64_t end) {
     return std::size_t(std::lower_bound(patch.begin(), patch.end(), end) - patch.begin());
   };
-  std::int64_t first = elements.tet_count;
+  std::int64_t first = elements.solids();
   std::size_t begin = before(first);
   add_blocks(plan, elements, patch.first(begin), slot_of);
   for (const StencilGroup& group : elements.groups) {
@@ -117,8 +131,10 @@ void add_elements(MeshPlan& plan, const MeshElements& elements, std::span<const 
 
 MeshPlan build_plan(const MeshElements& elements, int patch_size,
                     const std::function<void(double)>& progress) {
+  // tetrahedra and stencils
+  const std::int64_t single = elements.tet_count + elements.count() - elements.solids();
   const Partition mesh =
-      partition_mesh(elements, (elements.count() + patch_size - 1) / patch_size, lanes);
+      partition_mesh(elements, (single + patch_size - 1) / patch_size, lanes);
   progress(0.3);
 
   Numbering numbering = number_vertices(mesh, elements);

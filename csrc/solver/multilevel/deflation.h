@@ -195,13 +195,24 @@ struct TurningStrain {
   }
 };
 
-// sum += the product of the strains of two modes, 0 to 5 of their groups: of six numbers half are none
-template <class R>
+// sum += the product of the strains of two modes, 0 to 5 of their groups: of six numbers half are none. `Dilates`: `a` has
+// the trace's part of a dilated_strain.
+template <bool Dilates = false, class R>
 PD_HD void add_strain_product(const R (&a)[6], int i, const R (&b)[6], int j, R& sum) {
   PD_UNROLL
   for (int c = 0; c < 6; ++c) {
-    if (strain_has(i, c) && strain_has(j, c)) sum = multiply_add(a[c], b[c], sum);
+    const bool has = strain_has(i, c) || (Dilates && c < 3);
+    if (has && strain_has(j, c)) sum = multiply_add(a[c], b[c], sum);
   }
+}
+
+// Adds the part of lambda to 2 mu V times a strain, for its product with another: V lambda / 3 tr(a) tr(b). A third of
+// lambda keeps Hc <= Ac, since tr(dF)^2 <= 3 |dF|^2 and Ac weighs |dF|^2 with 2 mu + lambda.
+template <class R>
+PD_HD void add_dilation(const R (&strain)[6], const R& pressure, R (&weighted)[6]) {
+  const R trace = (strain[0] + strain[1]) + strain[2];
+  const R part = R(scalar_of<R>(1.0 / 3.0)) * pressure * trace;
+  for (int c = 0; c < 3; ++c) weighted[c] = weighted[c] + part;
 }
 
 }  // namespace pd::inline PD_TARGET
