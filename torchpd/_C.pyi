@@ -6,10 +6,12 @@ from typing import Any
 from numpy import float64, int32, int64
 from numpy.typing import NDArray
 
+Stencils = list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]]
+
 def build_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],
-    stencils: list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]],
+    stencils: Stencils,
     tet_group: NDArray[int64] | None,
     patch_size: int,
     progress: Callable[[float], None],
@@ -17,6 +19,7 @@ def build_plan(
 def build_device_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],
+    stencils: Stencils,
     patches: int,
     kernel: int,
     fixed: bool,
@@ -40,6 +43,7 @@ def stencil_table() -> list[tuple[str, str, int, str, str]]: ...
 def kind_table() -> list[tuple[str, int, int, int, tuple[str, ...], str]]: ...
 def multilevel_table() -> list[tuple[str, str, int, str, str]]: ...
 def device_plan_table() -> list[tuple[str, str, int, str, str]]: ...
+def device_stencil_table() -> list[tuple[str, str, int, str, str]]: ...
 def device_sizes() -> list[str]: ...
 def material_table() -> list[tuple[str, int, str, str, bool]]: ...
 def material_columns() -> list[tuple[str, str, int, int, str]]: ...
@@ -56,11 +60,13 @@ def step_bytes(
     real: int,
     sizes: NDArray[int32],
     level_sizes: NDArray[int32],
+    stencil_sizes: NDArray[int32],
     schedule: int,
     batch: int,
     planes: int,
     spheres: int,
     own_stiffness: bool,
+    own_effects: bool,
 ) -> int: ...
 
 info_numbers: int

@@ -20,9 +20,10 @@ struct ConjugateTensors {
 
 template <class Backend, class T>
 void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t iterations) {
-  ConjugateCall<T, typename Backend::template Plan<T>> call;
+  typename Backend::template Conjugate<T> call;
   const Place place{t.positions.device()};
   call.plan = Backend::template plan_view<T>(t.plan, place);
+  Backend::view_stencils(call, t.plan, place);
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
   const Tensor x = t.positions.contiguous();
@@ -43,7 +44,8 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   };
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
-  const EffectArrays<T> effects(call.plan, t.material, call.batch, place);
+  const EffectArrays<T> effects(Backend::stencil_counts(call), call.plan.tets, t.material,
+                                call.batch, place);
   call.effects = effects.view;
   call.inertia = of_vertices(a, "inertia", "N/m");
   call.inverse = of_vertices(inverse, "inverse", "of the diagonal [m/N], 0 for what is held");

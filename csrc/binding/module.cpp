@@ -123,19 +123,29 @@ pd::MeshElements mesh_elements(const Doubles& positions, const Indices& tets,
   pd::MeshElements elements{positions.data(), positions.shape(0), tets.data(), tets.shape(0)};
   for (const Stencils& group : stencils)
     elements.groups.push_back(stencil_group(group, positions.shape(0)));
+  constexpr std::int64_t most = std::int64_t(1) << 28;
+  if (elements.count() > most)
+    throw py::value_error("a scene may have up to 2^28 = " + std::to_string(most) +
+                          " elements, whose corners 32 bits count, got " +
+                          std::to_string(elements.count()) + "; take a coarser mesh");
   return elements;
 }
 
-// Number of stencils of each kind, after the counts of StencilSize.
+// Adds the number of stencils of each kind, after the counts of StencilSize.
+void add_kinds(std::vector<std::int32_t>& sizes, const pd::MeshElements& elements) {
+  sizes.resize(pd::stencil_size_count + int(pd::KindNumber::count), 0);
+  for (const pd::StencilGroup& group : elements.groups)
+    sizes[pd::stencil_size_count + group.kind] = std::int32_t(group.count);
+}
+
 std::vector<std::int32_t> stencil_sizes(const pd::MeshPlan& plan, const pd::MeshElements& elements,
                                         int lanes) {
-  std::vector<std::int32_t> sizes(pd::stencil_size_count + int(pd::KindNumber::count));
+  std::vector<std::int32_t> sizes(pd::stencil_size_count);
   sizes[pd::stencil_blocks] = std::int32_t(plan.stencil_block.size() / 4);
   sizes[pd::stencil_corner_rows] = std::int32_t(plan.stencil_corner.size() / lanes);
   sizes[pd::stencil_stored_rows] = std::int32_t(plan.stencil_stored.size() / lanes);
   sizes[pd::stencil_number_rows] = plan.stencil_numbers;
-  for (const pd::StencilGroup& group : elements.groups)
-    sizes[pd::stencil_size_count + group.kind] = std::int32_t(group.count);
+  add_kinds(sizes, elements);
   return sizes;
 }
 
@@ -149,8 +159,7 @@ pd::TetGroups tet_groups(const std::optional<Indices>& group, const Indices& tet
 
 py::dict build_plan(const Doubles& positions, const Indices& tets,
                     const std::vector<Stencils>& stencils, const std::optional<Indices>& tet_group,
-                    int patch_size,
-                    const std::function<void(double)>& progress) {
+                    int patch_size, const std::function<void(double)>& progress) {
   pd::MeshElements elements = mesh_elements(positions, tets, stencils);
   elements.averaged = tet_groups(tet_group, tets);
   if (patch_size < 16 || patch_size > 8192)
@@ -205,16 +214,21 @@ void check_cluster(std::int64_t vertices, const Indices& tets, int patches) {
                           " belongs to no tetrahedron, which kernel 1, a cluster, wants of all");
 }
 
-py::dict build_device_plan(const Doubles& positions, const Indices& tets, int patches, int kernel,
+py::dict build_device_plan(const Doubles& positions, const Indices& tets,
+                           const std::vector<Stencils>& stencils, int patches, int kernel,
                            bool fixed, const Numbers& piece,
                            const std::function<void(double)>& progress) {
-  check_mesh(positions, tets);
-  if (patches < 1 || patches > tets.shape(0)) {
-    throw py::value_error("patches must lie in 1.." + std::to_string(tets.shape(0)) +
-                          ", the number of tetrahedra, got " + std::to_string(patches));
+  const pd::MeshElements elements = mesh_elements(positions, tets, stencils);
+  if (patches < 1 || patches > elements.count()) {
+    throw py::value_error("patches must lie in 1.." + std::to_string(elements.count()) +
+                          ", the number of elements, got " + std::to_string(patches));
   }
   if (kernel < 0 || kernel > 3)
     throw py::value_error("kernel must be 0, 1, 2 or 3, got " + std::to_string(kernel));
+  if (!stencils.empty() && kernel != int(pd::DeviceKernel::block) &&
+      kernel != int(pd::DeviceKernel::stream))
+    throw py::value_error("kernel must be 0 (block) or 3 (stream) for a scene with stencils, got " +
+                          std::to_string(kernel));
   const std::int64_t vertices = positions.shape(0);
   if (kernel == int(pd::DeviceKernel::cluster)) check_cluster(vertices, tets, patches);
   if (piece.ndim() != 1 || piece.shape(0) != vertices)
@@ -223,11 +237,13 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets, int pa
     if (piece.at(v) < -1 || piece.at(v) >= vertices)
       throw py::value_error("piece must hold numbers of pieces, counted from 0, or -1");
   }
-  auto plan = pd::build_device_plan(positions.data(), vertices, tets.data(), tets.shape(0), patches,
-                                    kernel, fixed, piece.data(), progress);
+  auto plan = pd::build_device_plan(elements, patches, kernel, fixed, piece.data(), progress);
   py::dict arrays;
 #define X(name, type, width, rows, meaning) arrays[#name] = as_array(plan.name, width);
 #include "views/gpu_plan.def"
+  if (stencils.empty()) return arrays;
+  add_kinds(plan.stencil_sizes, elements);
+#include "views/gpu_stencils.def"
 #undef X
   return arrays;
 }
@@ -275,6 +291,9 @@ constexpr TableRow multilevel_rows[] = {
 };
 constexpr TableRow device_plan_rows[] = {
 #include "views/gpu_plan.def"
+};
+constexpr TableRow device_stencil_rows[] = {
+#include "views/gpu_stencils.def"
 };
 #undef X
 
@@ -357,21 +376,23 @@ py::dict build_info() {
 
 // Memory that a step needs on the current CUDA device, for a plan of given counts.
 template <class T>
-std::int64_t bytes_of([[maybe_unused]] const pd::DeviceStep<T>& step) {
+std::int64_t bytes_of([[maybe_unused]] const pd::MixedStep<T>& step) {
 #if defined(TORCHPD_CUDA)
-  return pd::step_bytes(step);
+  return step.stencils.blocks > 0 ? pd::mixed_step_bytes(step) : pd::step_bytes(step);
 #else
   throw std::runtime_error("this build of torchpd has no CUDA kernels");
 #endif
 }
 
 template <class T>
-std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes, int schedule,
-                        std::int64_t batch, int planes, int spheres, bool own_stiffness) {
-  const bool levels = level_sizes.size() > 0;
-  if (sizes.size() != pd::size_count || (levels && level_sizes.size() != pd::level_size_count))
-    throw py::value_error("sizes and level_sizes must be those of a plan for a GPU");
-  pd::DeviceStep<T> step;
+std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes,
+                        const Numbers& stencil_sizes, int schedule, std::int64_t batch, int planes,
+                        int spheres, bool own_stiffness, bool own_effects) {
+  const bool levels = level_sizes.size() > 0, stencils = stencil_sizes.size() > 0;
+  if (sizes.size() != pd::size_count || (levels && level_sizes.size() != pd::level_size_count) ||
+      (stencils && stencil_sizes.size() < pd::stencil_size_count))
+    throw py::value_error("sizes, level_sizes and stencil_sizes must be those of a plan for a GPU");
+  pd::MixedStep<T> step;
   step.plan = pd::count_device_plan<T>(sizes.data());
   if (levels) step.plan.levels = pd::count_levels<T>(level_sizes.data(), step.plan.vertices);
   step.settings.schedule = pd::ScheduleKind(schedule);
@@ -379,6 +400,12 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes, int sc
   step.material.planes_count = planes;
   step.material.spheres_count = spheres;
   step.material.stiffness.stride = own_stiffness ? step.plan.tets : 0;
+  if (stencils) {
+    step.stencils.blocks = stencil_sizes.data()[pd::stencil_blocks];
+    step.stencils.number_rows = stencil_sizes.data()[pd::stencil_number_rows];
+  }
+  // whichever of them it is
+  step.effects.bending.stride = own_effects ? 1 : 0;
   return bytes_of(step);
 }
 
@@ -415,8 +442,8 @@ PYBIND11_MODULE(_C, m) {
   m.def("build_plan", &build_plan, py::arg("positions"), py::arg("tets"), py::arg("stencils"),
         py::arg("tet_group"), py::arg("patch_size"), py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
-        py::arg("patches"), py::arg("kernel"), py::arg("fixed"), py::arg("piece"),
-        py::arg("progress"));
+        py::arg("stencils"), py::arg("patches"), py::arg("kernel"), py::arg("fixed"),
+        py::arg("piece"), py::arg("progress"));
   m.def("build_multilevel", &build_multilevel, py::arg("positions"), py::arg("tets"),
         py::arg("stencils"), py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"),
         py::arg("most_direct"), py::arg("folded"), py::arg("threads"), py::arg("progress"));
@@ -434,6 +461,9 @@ PYBIND11_MODULE(_C, m) {
   m.def(
       "device_plan_table", [] { return table(device_plan_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays on a GPU, in op order.");
+  m.def(
+      "device_stencil_table", [] { return table(device_stencil_rows); },
+      "Rows (name, type, width, rows, meaning) of the arrays of stencils on a GPU, in op order.");
   m.def("device_sizes", &device_sizes, "Names of the numbers in a GPU plan's sizes.");
   m.def("material_table", &material_table,
         "Rows (name, width, rows, meaning, effect) of the differentiable arrays, in op order.");
@@ -471,15 +501,18 @@ PYBIND11_MODULE(_C, m) {
       "Blocks of the largest cluster that the current CUDA device runs; 1: none.");
   m.def(
       "step_bytes",
-      [](std::size_t real, const Numbers& sizes, const Numbers& level_sizes, int schedule,
-         std::int64_t batch, int planes, int spheres, bool own_stiffness) {
+      [](std::size_t real, const Numbers& sizes, const Numbers& level_sizes,
+         const Numbers& stencil_sizes, int schedule, std::int64_t batch, int planes, int spheres,
+         bool own_stiffness, bool own_effects) {
         const auto bytes = real == sizeof(float) ? step_bytes<float> : step_bytes<double>;
-        return bytes(sizes, level_sizes, schedule, batch, planes, spheres, own_stiffness);
+        return bytes(sizes, level_sizes, stencil_sizes, schedule, batch, planes, spheres,
+                     own_stiffness, own_effects);
       },
-      py::arg("real"), py::arg("sizes"), py::arg("level_sizes"), py::arg("schedule"),
-      py::arg("batch"), py::arg("planes"), py::arg("spheres"), py::arg("own_stiffness"),
+      py::arg("real"), py::arg("sizes"), py::arg("level_sizes"), py::arg("stencil_sizes"),
+      py::arg("schedule"), py::arg("batch"), py::arg("planes"), py::arg("spheres"),
+      py::arg("own_stiffness"), py::arg("own_effects"),
       "Memory that the current CUDA device wants for a step; level_sizes: none without a "
-      "preconditioner.");
+      "preconditioner; stencil_sizes: none without stencils.");
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("corotation_bytes") = pd::corotation_bytes;
   m.attr("outlier_ratio") = pd::outlier_ratio;

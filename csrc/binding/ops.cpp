@@ -18,8 +18,21 @@ struct Cpu {
   using Plan = pd::Plan<T>;
 
   template <class T>
+  using Step = StepCall<T>;
+  template <class T>
+  using Field = FieldCall<T>;
+  template <class T>
+  using Conjugate = ConjugateCall<T>;
+
+  template <class T>
   static Plan<T> plan_view(at::TensorList arrays, const Place& place) {
     return pd::plan_view<T>(arrays, place);
+  }
+  template <class Call>
+  static void view_stencils(Call&, at::TensorList, const Place&) {}  // the plan has them
+  template <class Call>
+  static const int32* stencil_counts(const Call& call) {
+    return pd::stencil_counts(call.plan);
   }
 
   static void step(const StepCall<float>& call, const Tensor&) {

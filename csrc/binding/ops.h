@@ -1,8 +1,9 @@
 // Common parts of the ops on either device: checks, views, one call of the backend.
 //
-// A Backend has `Plan<T>`, the plan that its kernels read, and `plan_view<T>(arrays, place)`. Its functions `step`,
-// `report`, `field`, `precondition`, `conjugate` and `rotation` run a call on the device of the tensor they are
-// given.
+// A Backend has `Plan<T>`, the plan that its kernels read, and `plan_view<T>(arrays, place)`. `Step<T>`, `Field<T>` and
+// `Conjugate<T>` are its calls with effects; `view_stencils(call, arrays, place)` adds the stencils of the plan to one,
+// and `stencil_counts(call)` is their number of each kind, null without any. Its functions `step`, `report`, `field`,
+// `precondition`, `conjugate` and `rotation` run a call on the device of the tensor they are given.
 #pragma once
 #include "binding/checks.h"
 #include "binding/conjugate_ops.h"
@@ -32,13 +33,16 @@ struct StepTensors {
 
 template <class Backend, class T>
 void step_typed(const StepTensors& t, const Settings& settings) {
-  StepCall<T, typename Backend::template Plan<T>> call;
+  typename Backend::template Step<T> call;
   const Place place{t.positions.device()};
   call.plan = Backend::template plan_view<T>(t.plan, place);
+  Backend::view_stencils(call, t.plan, place);
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
   check_levels(call.plan, settings.multilevel());
   call.material = material_view<T>(call.plan, t.material, call.batch, place);
+  call.effects =
+      effects_view<T>(Backend::stencil_counts(call), call.plan.tets, t.material, call.batch, place);
   check_tets(t.material[0], call.plan.tets);
   call.settings = settings;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
@@ -145,9 +149,10 @@ template <class Backend, class T>
 void field_typed(Field field, const Tensor& positions, const Tensor& direction,
                  at::TensorList material, at::TensorList plan, const Tensor& out,
                  const Tensor& displacement = {}, const std::vector<Tensor>& products = {}) {
-  FieldCall<T, typename Backend::template Plan<T>> call;
+  typename Backend::template Field<T> call;
   const Place place{positions.device()};
   call.plan = Backend::template plan_view<T>(plan, place);
+  Backend::view_stencils(call, plan, place);
   call.field = field;
   call.batch = positions.size(0);
   check_vertices(positions, call.plan.vertices);
@@ -155,7 +160,8 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
   const Tensor d = direction.defined() ? direction.contiguous() : Tensor();
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
-  const EffectArrays<T> effects(call.plan, material, call.batch, place);
+  const EffectArrays<T> effects(Backend::stencil_counts(call), call.plan.tets, material, call.batch,
+                                place);
   call.effects = effects.view;
   for (std::size_t i = 0; i < products.size(); ++i) {
     if (products[i].numel() > 0) call.products[i] = products[i].template mutable_data_ptr<T>();
@@ -206,8 +212,9 @@ Tensor effect_energy(const Tensor& positions, at::TensorList material, at::Tenso
 template <class Backend>
 Tensor lame_product(const Tensor& positions, const OptionalTensor& direction,
                     at::TensorList material, at::TensorList plan) {
-  TORCH_CHECK_VALUE(has_poisson(material), "material.poisson must be [tets] or [batch, tets] for "
-                                           "the derivatives by it, got none");
+  TORCH_CHECK_VALUE(has_poisson(material),
+                    "material.poisson must be [tets] or [batch, tets] for "
+                    "the derivatives by it, got none");
   return run_field<Backend>(Field::lame_product, positions, direction.value_or(Tensor()), material,
                             plan);
 }
@@ -263,20 +270,24 @@ Tensor element_energy_product(const Tensor& positions, const Tensor& direction,
 
 template <class Backend, class T>
 Tensor material_field(Field field, at::TensorList material, at::TensorList plan, bool weighted) {
-  FieldCall<T, typename Backend::template Plan<T>> call;
+  typename Backend::template Field<T> call;
   const Tensor& stiffness = array_of(material, "stiffness");
   const Place place{stiffness.device(), "stiffness"};
   call.plan = Backend::template plan_view<T>(plan, place);
+  Backend::view_stencils(call, plan, place);
   call.field = field;
   call.weighted = weighted;
   const Tensor w = stiffness_of(material, call.plan.tets);
   const std::optional<std::int64_t> own = environments_of(material);
   const bool batched = own.has_value();
   call.batch = own.value_or(1);
-  const EffectArrays<T> effects(call.plan, material, call.batch, place);
+  const EffectArrays<T> effects(Backend::stencil_counts(call), call.plan.tets, material, call.batch,
+                                place);
   call.effects = effects.view;
+  const int32* counts = Backend::stencil_counts(call);
+  if (field == Field::stiffness_at_rest && !counts && !has_poisson(material)) return w.clone();
   const std::int64_t rows =
-      field == Field::diagonal ? call.plan.vertices : count_elements(call.plan);
+      field == Field::diagonal ? call.plan.vertices : count_elements(call.plan.tets, counts);
   const Tensor out =
       batched ? at::empty({call.batch, rows}, w.options()) : at::empty({rows}, w.options());
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",

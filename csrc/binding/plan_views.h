@@ -63,22 +63,35 @@ constexpr int stencil_arrays = 0
 #undef X
 static_assert(stencil_arrays != level_arrays);  // the number of arrays tells what follows
 
-// Lengths of the arrays, by the names in cpu_stencils.def.
+#define X(name, type, width, rows, meaning) +1
+constexpr int device_stencil_arrays = 0
+#include "views/gpu_stencils.def"
+    ;
+#undef X
+static_assert(device_stencil_arrays != level_arrays);
+
+// Lengths of the arrays, by the names in cpu_stencils.def and gpu_stencils.def.
 struct StencilRows {
   std::int64_t stencil_size, stencil_block, patch_end, stencil_corner_row, stencil_stored_row;
 };
 
+// The counts of the stencils, of every kind too.
+inline StencilRows count_stencils(const Tensor& sizes, int patches) {
+  constexpr int count = stencil_size_count + int(KindNumber::count);
+  check_array(sizes, at::kInt, count, 1, {at::kCPU, "every plan's sizes"}, "plan.stencil_sizes",
+              "counts");
+  const int32* size = sizes.const_data_ptr<int32>();
+  return {count, size[stencil_blocks], patches + 1, size[stencil_corner_rows],
+          size[stencil_stored_rows]};
+}
+
 // The arrays of the stencils, which begin at `first`.
 template <class T>
 void view_stencils(Plan<T>& plan, at::TensorList arrays, int first, const Place& place) {
-  constexpr int sizes = stencil_size_count + int(KindNumber::count);
-  check_array(arrays[first], at::kInt, sizes, 1, {at::kCPU, "every plan's sizes"},
-              "plan.stencil_sizes", "counts");
+  const StencilRows count = count_stencils(arrays[first], plan.patches);
   const int32* size = arrays[first].const_data_ptr<int32>();
   plan.stencil_blocks = size[stencil_blocks];
   plan.stencil_numbers = size[stencil_number_rows];
-  const StencilRows count{sizes, plan.stencil_blocks, plan.patches + 1, size[stencil_corner_rows],
-                          size[stencil_stored_rows]};
   int at = first;
   using real = T;
 #define X(name, type, width, rows, meaning)                                                     \
@@ -130,17 +143,15 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, std::int64
   return levels;
 }
 
-// Tetrahedra and stencils of a plan.
-template <class T>
-std::int64_t count_elements(const Plan<T>& plan) {
-  std::int64_t elements = plan.tets;
-  for (int k = 0; plan.stencil_blocks && k < int(KindNumber::count); ++k)
-    elements += plan.stencil_sizes[stencil_size_count + k];
+// Tetrahedra and stencils of a plan. `counts`: stencils of each kind; null without any.
+inline std::int64_t count_elements(std::int64_t tets, const int32* counts) {
+  std::int64_t elements = tets;
+  for (int k = 0; counts && k < int(KindNumber::count); ++k) elements += counts[k];
   return elements;
 }
 template <class T>
-std::int64_t count_elements(const DevicePlan<T>& plan) {
-  return plan.tets;
+const int32* stencil_counts(const Plan<T>& plan) {
+  return plan.stencil_blocks > 0 ? plan.stencil_sizes + stencil_size_count : nullptr;
 }
 
 // Lengths of the arrays are checked; their contents are trusted.
@@ -195,7 +206,8 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
 #undef X
   if (stencils) view_stencils(plan, arrays, plan_arrays, place);
   if (levels)
-    plan.levels = levels_view<T>(arrays, levels_at, plan.vertices, count_elements(plan), place);
+    plan.levels = levels_view<T>(arrays, levels_at, plan.vertices,
+                                 int(count_elements(plan.tets, stencil_counts(plan))), place);
   return plan;
 }
 
@@ -228,12 +240,40 @@ struct DevicePlanRows {
       stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex;
 };
 
+// Whether the arrays of the stencils follow those of the plan; a plan with levels has none.
+inline bool has_device_stencils(at::TensorList arrays) {
+  return arrays.size() == device_plan_arrays + device_stencil_arrays;
+}
+
+// The arrays of the stencils, without any if the plan has none.
+template <class T>
+DeviceStencils<T> device_stencils_view(at::TensorList arrays, int patches, const Place& place) {
+  DeviceStencils<T> stencils;
+  if (!has_device_stencils(arrays)) return stencils;
+  const StencilRows count = count_stencils(arrays[device_plan_arrays], patches);
+  const int32* size = arrays[device_plan_arrays].const_data_ptr<int32>();
+  stencils.blocks = size[stencil_blocks];
+  stencils.number_rows = size[stencil_number_rows];
+  const Place on_cpu{at::kCPU, "every plan's sizes"};
+  int at = device_plan_arrays;
+  using real = T;
+#define X(name, type, width, rows, meaning)                                       \
+  check_array(arrays[at], scalar_type<type>, count.rows, width,                   \
+              at == device_plan_arrays ? on_cpu : place, "plan." #name, meaning); \
+  stencils.name = arrays[at++].const_data_ptr<type>();
+#include "views/gpu_stencils.def"
+#undef X
+  return stencils;
+}
+
 template <class T>
 DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   constexpr int with_levels = device_plan_arrays + level_arrays;
-  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || arrays.size() == with_levels,
+  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || arrays.size() == with_levels ||
+                        has_device_stencils(arrays),
                     "plan must be the ", device_plan_arrays, " arrays of a plan for ",
-                    place.device.str(), ", or ", with_levels,
+                    place.device.str(), ", ", device_plan_arrays + device_stencil_arrays,
+                    " with stencils, or ", with_levels,
                     " with those of a multilevel preconditioner, got ", arrays.size(),
                     "; sim.to(...) compiles the plan of a device");
   const int32* size = sizes_view(arrays[0], size_count);
@@ -245,7 +285,11 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
                     "kernel 0, got kernel ",
                     plan.kernel, " and ", plan.patches, " patches; compile the scene again");
   constexpr int stream = 3;  // as in DeviceKernel, which this file does not include
-  TORCH_CHECK_VALUE(arrays.size() == device_plan_arrays || plan.kernel == stream,
+  TORCH_CHECK_VALUE(!has_device_stencils(arrays) || plan.kernel == 0 || plan.kernel == stream,
+                    "plan must be one for kernel 0 (block) or 3 (stream) where it has stencils, "
+                    "got kernel ",
+                    plan.kernel);
+  TORCH_CHECK_VALUE(arrays.size() != with_levels || plan.kernel == stream,
                     "plan must be one for kernel 3 (stream) where it has a multilevel "
                     "preconditioner, which no other knows, got kernel ",
                     plan.kernel);
@@ -397,21 +441,16 @@ inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
   return t.size(width > 1 ? -2 : -1);
 }
 
-// Every stencil needs its row of each array that its kind reads.
-template <class T>
-void check_effects(const Plan<T>& plan, at::TensorList material) {
-  if (plan.stencil_blocks == 0) return;
+// Every stencil needs its row of each array that its kind reads. `counts`: stencils of each kind; null without any.
+inline void check_effects(const int32* counts, at::TensorList material) {
+  if (!counts) return;
   TORCH_CHECK_VALUE(material.size() == all_material_arrays, "material must be ",
                     all_material_arrays, " arrays for a plan with stencils, got ", material.size());
 #define KIND(kind, type, what)
-#define PARAMETER(kind, array)          \
-  check_effect(material, #array, #kind, \
-               plan.stencil_sizes[stencil_size_count + int(KindNumber::kind)]);
+#define PARAMETER(kind, array) check_effect(material, #array, #kind, counts[int(KindNumber::kind)]);
 #include "elements/kinds.def"
 #undef KIND
 }
-template <class T>
-void check_effects(const DevicePlan<T>&, at::TensorList) {}
 
 // Whether a material has Poisson's ratio.
 inline bool has_poisson(at::TensorList material) {
@@ -427,13 +466,13 @@ inline void check_poisson(at::TensorList material, std::int64_t tets) {
 }
 
 // The arrays that only some scenes have.
-template <class P, class T>
-Effects<T> effects_view(const P& plan, at::TensorList arrays, std::int64_t batch,
-                        const Place& place) {
+template <class T>
+Effects<T> effects_view(const int32* counts, std::int64_t tets, at::TensorList arrays,
+                        std::int64_t batch, const Place& place) {
   Effects<T> effects;
-  check_effects(plan, arrays);
+  check_effects(counts, arrays);
   if (arrays.size() == material_arrays) return effects;
-  check_poisson(arrays, plan.tets);
+  check_poisson(arrays, tets);
   int at = material_arrays;
 #define X(name, width, rows, meaning)
 #define EFFECT(name, width, rows, meaning)                                                        \
@@ -451,13 +490,13 @@ struct EffectArrays {
   std::vector<Tensor> kept;
   Effects<T> view;
 
-  template <class P>
-  EffectArrays(const P& plan, at::TensorList material, std::int64_t batch, const Place& place) {
+  EffectArrays(const int32* counts, std::int64_t tets, at::TensorList material, std::int64_t batch,
+               const Place& place) {
     if (material.size() > material_arrays) {
       for (const Tensor& array : material) kept.push_back(array.contiguous());
-      view = effects_view<P, T>(plan, kept, batch, place);
+      view = effects_view<T>(counts, tets, kept, batch, place);
     } else {
-      check_effects(plan, material);
+      check_effects(counts, material);
     }
   }
 };
@@ -497,7 +536,6 @@ Material<T> material_view(const P& plan, at::TensorList arrays, std::int64_t bat
 #undef X
   material.planes_count = int(count.plane);
   material.spheres_count = int(count.sphere);
-  material.effects = effects_view<P, T>(plan, arrays, batch, place);
   return material;
 }
 

@@ -29,8 +29,9 @@ class SolvedStep {
     check_vertices(t.after, call.plan.vertices);
     call.material = material_view<T>(call.plan, t.material, call.batch, place);
     const Material<T>& m = call.material;
-    call.elastic = {keep(diagonal_typed<Backend, T>(t.material, t.plan, true)),
-                    environments_of(t.material) > 1 ? call.plan.vertices : 0};
+    const Tensor elastic = diagonal_typed<Backend, T>(t.material, t.plan, true);
+    const bool own = elastic.dim() == 2 && elastic.size(0) == call.batch;
+    call.elastic = {keep(elastic), own ? call.plan.vertices : 0};
     touching = m.planes_count + m.spheres_count > 0;
     call.time_step = time_step;
     call.grad_positions = keep(t.grad_positions);

@@ -75,8 +75,13 @@ enum StencilSize : int {
 };
 
 template <class T>
+struct EffectViews;
+struct NoEffectViews;
+
+template <class T>
 struct Plan {
   using real = T;
+  using EffectViews = pd::EffectViews<T>;
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/cpu_plan.def"
 #include "views/cpu_stencils.def"
@@ -101,10 +106,11 @@ enum DeviceSize : int {
   size_count
 };
 
-// The constant arrays of a GPU plan. All but `sizes` are in the GPU's memory.
+// The constant arrays of a GPU plan for tetrahedra. All but `sizes` are in the GPU's memory.
 template <class T>
 struct DevicePlan {
   using real = T;
+  using EffectViews = NoEffectViews;
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/gpu_plan.def"
 #undef X
@@ -112,6 +118,22 @@ struct DevicePlan {
 #include "views/gpu_sizes.def"
 #undef X
   Levels<T> levels;
+};
+
+// The constant arrays of its stencils. All but `stencil_sizes` are in the GPU's memory.
+template <class T>
+struct DeviceStencils {
+  using real = T;
+#define X(name, type, width, rows, meaning) const type* name = nullptr;
+#include "views/gpu_stencils.def"
+#undef X
+  int blocks = 0, number_rows = 0;  // blocks of 32 stencils; rows of 32 numbers of a step
+};
+
+// A call on a GPU with what only scenes with stencils have; blocks = 0 without them.
+template <class Call>
+struct Mixed : Call, EffectViews<typename Call::real> {
+  DeviceStencils<typename Call::real> stencils;
 };
 
 // The counts of a plan or its levels, from their array of sizes; without the other arrays.
@@ -170,21 +192,29 @@ enum EffectNumber : int {
   effect_count
 };
 
+// The arrays of the effects, as a base of calls. On a GPU only scenes with stencils pass them: see Mixed.
+template <class T>
+struct EffectViews {
+  Effects<T> effects;
+  // Field::effect_products: for each array of the effects [batch, rows], null if not wanted
+  T* products[effect_count] = {};
+};
+struct NoEffectViews {};
+
 template <class T>
 struct Material {
 #define X(name, width, rows, meaning) Values<T> name;
 #include "views/material.def"
 #undef X
   int planes_count = 0, spheres_count = 0;
-  Effects<T> effects;
 };
 
-// Whether all environments have the same elastic material.
+// Whether all environments have the same arrays.
 template <class T>
-bool shares_elasticity(const Material<T>& material) {
-  bool shared = material.stiffness.stride == 0;
+bool shares_effects(const Effects<T>& effects) {
+  bool shared = true;
 #define X(name, width, rows, meaning)
-#define EFFECT(name, width, rows, meaning) shared = shared && material.effects.name.stride == 0;
+#define EFFECT(name, width, rows, meaning) shared = shared && effects.name.stride == 0;
 #include "views/material.def"
 #undef X
   return shared;
@@ -227,7 +257,8 @@ enum InfoField : int {
 
 // Inputs and outputs of a call of step or rollout. Positions are in the user's order, [batch, vertices, 3].
 template <class T, class P = Plan<T>>
-struct StepCall {
+struct StepCall : P::EffectViews {
+  using real = T;
   P plan;
   Material<T> material;
   Settings settings;
@@ -259,11 +290,11 @@ enum class Field : int {
 };
 
 template <class T, class P = Plan<T>>
-struct FieldCall {
+struct FieldCall : P::EffectViews {
+  using real = T;
   P plan;
   Field field = Field::gradient;
   Values<T> stiffness;
-  Effects<T> effects;
   std::int64_t batch = 0;
   bool weighted = false;         // weighted by l_e; for the diagonal
   const T* positions = nullptr;  // [batch, vertices, 3], for all but the diagonal
@@ -274,8 +305,6 @@ struct FieldCall {
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, tets, 2] of lame_product,
                // [batch, vertices] of the diagonal
   // stiffness_at_rest: [batch, elements], tetrahedra and then stencils kind by kind
-  // effect_products: for each array of the effects [batch, rows], null if not wanted
-  T* products[effect_count] = {};
 };
 
 // Sums over the vertices of an environment for a report, see solver/report.h.
@@ -405,10 +434,10 @@ enum FrictionProgress : int {
 // preconditioner is a diagonal, or a plan's levels where it has them. With `friction` the solve of
 // solver/adjoint/friction.h follows where vertices slide; its solution is the multiplier.
 template <class T, class P = Plan<T>>
-struct ConjugateCall {
+struct ConjugateCall : P::EffectViews {
+  using real = T;
   P plan;
   Values<T> stiffness;
-  Effects<T> effects;
   Values<T> inertia, inverse;  // [vertices]; inverse diagonal, 0 where a vertex does not move
   std::int64_t batch = 0;
   const T* positions = nullptr;  // [batch, vertices, 3]

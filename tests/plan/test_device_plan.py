@@ -314,8 +314,8 @@ def test_too_few_patches_are_refused() -> None:
         vertices, tets = box((1.0, 1.0, 1.0), cells)
         piece = np.zeros(len(vertices), dtype=np.int32)
         with pytest.raises(ValueError, match=refusal):
-            _C.build_device_plan(vertices, tets, 1, STREAM, False, piece, lambda done: None)
-        plan = _C.build_device_plan(vertices, tets, 2, STREAM, False, piece, lambda done: None)
+            _C.build_device_plan(vertices, tets, [], 1, STREAM, False, piece, lambda done: None)
+        plan = _C.build_device_plan(vertices, tets, [], 2, STREAM, False, piece, lambda done: None)
         assert plan["sizes"][SIZES.index("patches")] == 2
 
 
@@ -327,8 +327,8 @@ def test_too_many_slots_are_refused() -> None:
     tets, piece = np.arange(4 * count).reshape(-1, 4), np.zeros(4 * count, dtype=np.int32)
     refusal = "patches = 1 is too few: one of them would have at least 8196 slots, and 16 bits count up to 8192; take"
     with pytest.raises(ValueError, match=refusal):
-        _C.build_device_plan(vertices, tets, 1, STREAM, False, piece, lambda done: None)
-    most = _C.build_device_plan(vertices[:-4], tets[:-1], 1, STREAM, False, piece[:-4], lambda done: None)
+        _C.build_device_plan(vertices, tets, [], 1, STREAM, False, piece, lambda done: None)
+    most = _C.build_device_plan(vertices[:-4], tets[:-1], [], 1, STREAM, False, piece[:-4], lambda done: None)
     assert most["sizes"][SIZES.index("most_slots")] == 8192
     assert (most["pair_corner"].view(np.uint32) & 65535).max() == 8 * 8191
 
@@ -344,14 +344,14 @@ def test_bad_arguments_are_refused() -> None:
         with pytest.raises(ValueError, match=refusal):
             compile_device_plan(values, 1, kernel, torch.float32)
         with pytest.raises(ValueError, match=refusal):
-            _C.build_device_plan(x, tets, 1, kernel, False, piece, lambda done: None)
+            _C.build_device_plan(x, tets, [], 1, kernel, False, piece, lambda done: None)
     with pytest.raises(ValueError, match=r"dtype .*got torch\.float16"):
         compile_device_plan(values, 1, 0, torch.float16)
     for bad in (4, -1, 2**40):
         with pytest.raises(IndexError, match=r"tets .*positions"):
-            _C.build_device_plan(x, np.array([[0, 1, 2, bad]]), 1, BLOCK, False, piece, lambda done: None)
+            _C.build_device_plan(x, np.array([[0, 1, 2, bad]]), [], 1, BLOCK, False, piece, lambda done: None)
     with pytest.raises(ValueError, match=r"piece .*int32 \[vertices\]"):
-        _C.build_device_plan(x, tets, 1, BLOCK, False, piece[:3], lambda done: None)
+        _C.build_device_plan(x, tets, [], 1, BLOCK, False, piece[:3], lambda done: None)
     for number in (-2, 4):
         with pytest.raises(ValueError, match=r"piece .*from 0, or -1"):
-            _C.build_device_plan(x, tets, 1, BLOCK, False, np.full(4, number, dtype=np.int32), lambda done: None)
+            _C.build_device_plan(x, tets, [], 1, BLOCK, False, np.full(4, number, dtype=np.int32), lambda done: None)

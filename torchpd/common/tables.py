@@ -9,6 +9,7 @@ from .. import _C
 __all__ = [
     "DEVICE_PLAN_TABLE",
     "DEVICE_SIZES",
+    "DEVICE_STENCIL_TABLE",
     "EFFECT_ROWS",
     "KINDS",
     "MATERIAL_TABLE",
@@ -26,7 +27,7 @@ __all__ = [
 
 
 class PlanRow(NamedTuple):
-    """A row of csrc/views/cpu_plan.def, cpu_stencils.def, multilevel.def or gpu_plan.def: a constant array."""
+    """A row of csrc/views/cpu_plan.def, gpu_plan.def, their stencils, or multilevel.def: a constant array."""
 
     name: str
     type: str
@@ -81,6 +82,7 @@ PLAN_TABLE = tuple(PlanRow(*row) for row in _C.plan_table())
 MULTILEVEL_TABLE = tuple(PlanRow(*row) for row in _C.multilevel_table())
 STENCIL_TABLE = tuple(PlanRow(*row) for row in _C.stencil_table())
 DEVICE_PLAN_TABLE = tuple(PlanRow(*row) for row in _C.device_plan_table())
+DEVICE_STENCIL_TABLE = tuple(PlanRow(*row) for row in _C.device_stencil_table())
 MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
 # arrays of the material that only some scenes have; they follow the others
 EFFECT_ROWS = tuple(row for row in MATERIAL_TABLE if row.effect)

@@ -244,8 +244,8 @@ def _step_bytes(sim: Stepper, real: int) -> str:
     batch = scene.environments
     each = -(-step_bytes(scene, plan, batch, sim.device) // batch)
     taken = f"{each:,} B per environment during a step{f' of {batch:,}' if batch > 1 else ''}"
-    if plan.kernel == "stream":
-        return taken
+    if plan.kernel == "stream" or (scene.has_stencils and batch > 1):
+        return taken  # each of them may have numbers of its own stencils
     # only environments that run at the same time take memory
     return f"{taken}, at most {step_bytes(scene, plan, _ANY_BATCH, sim.device):,} B in all"
 

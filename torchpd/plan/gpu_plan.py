@@ -11,13 +11,18 @@ from torch import Tensor
 
 from .. import _C
 from ..common.checks import tensor_of
-from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
+from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, DEVICE_STENCIL_TABLE, PlanRow
 from ..scene.scene import SceneValues
-from .cpu_plan import KERNELS, compile_progress, internal_numbers, loose_pieces
+from .cpu_plan import KERNELS, compile_progress, internal_numbers, loose_pieces, stencil_arrays
 
-__all__ = ["compile_device_plan"]
+__all__ = ["compile_device_plan", "device_table"]
 
 _SIZE_PINS = DEVICE_SIZES.index("pins")
+
+
+def device_table(values: SceneValues) -> tuple[PlanRow, ...]:
+    """Rows of the arrays of a scene's GPU plan."""
+    return DEVICE_PLAN_TABLE + DEVICE_STENCIL_TABLE if values.stencils else DEVICE_PLAN_TABLE
 
 
 def compile_device_plan(
@@ -27,30 +32,32 @@ def compile_device_plan(
 
     Args:
         values: the flat arrays of `Scene.values`.
-        patches: number of mesh patches, one thread block each: 1 to the number of tetrahedra. A cluster takes at most
+        patches: number of mesh patches, one thread block each: 1 to the number of elements. A cluster takes at most
             16 and at most the number of vertices. Indices in a patch have 16 bits, so about 20 000 tetrahedra need a
             second patch.
-        kernel: 0 (block), 1 (cluster), 2 (grid) or 3 (stream), the index into `KERNELS`.
+        kernel: 0 (block), 1 (cluster), 2 (grid) or 3 (stream), the index into `KERNELS`; 0 or 3 with stencils.
         dtype: torch.float32 or torch.float64.
         progress: show a bar when the mesh is large.
 
     Returns:
-        The arrays of csrc/views/gpu_plan.def in its order, on the CPU.
+        The arrays of csrc/views/gpu_plan.def in its order, then of gpu_stencils.def if there are any, on the CPU.
     """
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     if kernel not in range(len(KERNELS)):
         raise ValueError(f"kernel must be 0, 1, 2 or 3, got {kernel}")
     piece, _ = loose_pieces(values)
-    with compile_progress(len(values.tets), progress) as advance:
+    elements = len(values.tets) + sum(len(group) for group in values.stencils)
+    with compile_progress(elements, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
-            values.rest_positions, values.tets, patches, kernel, dtype == torch.float32, piece, advance
-        )
+            values.rest_positions, values.tets, stencil_arrays(values), patches, kernel, dtype == torch.float32, piece,
+            advance,
+        )  # fmt: skip
     pins = len(values.pin_vertices)
     arrays["sizes"][_SIZE_PINS] = pins
     if pins:
         arrays["pin_vertex"] = internal_numbers(arrays["vertex_order"])[values.pin_vertices]
         arrays["vertex_pin"] = np.full(len(values.rest_positions), -1, dtype=np.int32)
         arrays["vertex_pin"][arrays["pin_vertex"]] = np.arange(pins)
-    tensors = (tensor_of(arrays[row.name]) for row in DEVICE_PLAN_TABLE)
+    tensors = (tensor_of(arrays[row.name]) for row in device_table(values))
     return tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors)

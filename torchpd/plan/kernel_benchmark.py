@@ -37,7 +37,8 @@ def fastest_plan(plans: Iterator[Plan], scene: CompiledScene, dtype: torch.dtype
     candidates, values = list(plans), scene.scene.values()
     key = (
         torch.cuda.get_device_name(device), dtype, len(values.tets), len(values.rest_positions), len(values.planes),
-        len(values.spheres), len(values.pin_vertices), scene.environments, scene.iterations, scene.solver,
+        len(values.spheres), len(values.pin_vertices), *((group.kind, len(group)) for group in values.stencils),
+        scene.environments, scene.iterations, scene.solver,
         *((plan.kernel, plan.patches) for plan in candidates),
     )  # fmt: skip
     if key not in _TIMES:

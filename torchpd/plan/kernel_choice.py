@@ -17,6 +17,9 @@ tetrahedra at patch borders are computed more than once. Patches exchange no for
 of a vertex is written to the shared memory of the patches that hold a copy. The patches of the other kernels share no
 tetrahedra and exchange the forces on shared vertices.
 
+Scenes with stencils (cloth, rods, springs, ties, fibres) run as "block" where the mesh fits the shared memory of a
+block, else as "stream".
+
 The batch of a state has no influence: an environment gives the same bits alone and in any batch.
 """
 
@@ -32,13 +35,13 @@ import torch
 
 from .. import _C
 from ..common.gpu import Properties
-from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
+from ..common.tables import DEVICE_SIZES
 from ..scene.scene import SceneValues
 from .cpu_plan import KERNELS, Plan, quoted_choices
-from .gpu_plan import compile_device_plan
+from .gpu_plan import compile_device_plan, device_table
 from .kernel_costs import iteration_microseconds, kernel_microseconds
 
-__all__ = ["check_kernel", "choose_plan", "shared_bytes"]
+__all__ = ["OTHER_BODIES", "check_kernel", "choose_plan", "shared_bytes"]
 
 _MIN_GRID_TETS = 150  # least per patch: smaller patches cost more in exchange than they save
 # "auto" tries clusters for meshes of up to 8000 tetrahedra, with one patch per 75 while there are blocks
@@ -58,6 +61,9 @@ _STREAM_CONCURRENT = {torch.float32: 2, torch.float64: 1}
 # A pipeline takes patches larger by this factor: a multiprocessor computes one and holds two, if its shared memory
 # suffices and each has a patch. Its threads keep the slots in registers (csrc/cuda/stream/pipeline.h).
 _PIPELINE_GROWTH, _PIPELINE_BYTES = 1.2, 200_000
+_TET_ENTRIES = 2.5  # entries of a tetrahedron in shared memory: five of a pair
+_STENCIL_KERNELS = ("block", "stream")
+OTHER_BODIES = "cloth, rods, springs, ties or fibres"  # what has stencils, for errors
 _MAX_PASS_FIELDS = 2  # most fields of one pass: the products with a second derivative
 
 
@@ -103,6 +109,16 @@ class _PlanBuilder(NamedTuple):
         return len(self.values.tets)
 
     @property
+    def elements(self) -> int:
+        """Tetrahedra and stencils."""
+        return self.tets + sum(len(group) for group in self.values.stencils)
+
+    @property
+    def stencil_corners(self) -> int:
+        """Corners of all stencils, each with an entry in shared memory."""
+        return sum(group.corners.size for group in self.values.stencils)
+
+    @property
     def vertices(self) -> int:
         return len(self.values.rest_positions)
 
@@ -114,7 +130,7 @@ class _PlanBuilder(NamedTuple):
     def plan(self, kernel: str, patches: int) -> Plan:
         number = KERNELS.index(kernel)
         arrays = compile_device_plan(self.values, patches, number, self.dtype, progress=self.progress)
-        return Plan(arrays, DEVICE_PLAN_TABLE, loose=self.values.loose)
+        return Plan(arrays, device_table(self.values), loose=self.values.loose)
 
     def shared_bytes(self, plan: Plan) -> int:
         return max_shared_bytes(plan, len(self.values.planes), len(self.values.spheres))
@@ -140,18 +156,20 @@ class _PlanBuilder(NamedTuple):
                 return max(2, int(least), -(-self.tets // _MANY_TETS))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _MIN_LEVEL_TETS), rounds * gpu.multiprocessors)
-        patches = -(-self.tets // _STREAM_TETS[self.dtype])
+        # as many entries per patch as tetrahedra would have
+        tets = self.tets + math.ceil(self.stencil_corners / _TET_ENTRIES)
+        patches = -(-tets // _STREAM_TETS[self.dtype])
         # patches that do not run at once run in whole waves, of which the last is full too
         wave = _STREAM_CONCURRENT[self.dtype] * gpu.multiprocessors
         if self.uses_pipeline(gpu) and patches > gpu.multiprocessors:
             wave = gpu.multiprocessors
-            patches = max(wave, math.ceil(self.tets / (_PIPELINE_GROWTH * _STREAM_TETS[self.dtype])))
+            patches = max(wave, math.ceil(tets / (_PIPELINE_GROWTH * _STREAM_TETS[self.dtype])))
         return patches if patches <= wave else -(-patches // wave) * wave
 
     def uses_pipeline(self, gpu: Properties) -> bool:
-        """Whether "stream" runs as a pipeline with larger patches: float32, no contacts, enough shared memory."""
-        touching = len(self.values.planes) + len(self.values.spheres) > 0
-        return self.dtype == torch.float32 and not touching and gpu.shared >= _PIPELINE_BYTES
+        """Whether "stream" runs as a pipeline: float32, solids alone, no contacts, enough shared memory."""
+        others = len(self.values.planes) + len(self.values.spheres) + len(self.values.stencils) > 0
+        return self.dtype == torch.float32 and not others and gpu.shared >= _PIPELINE_BYTES
 
     def max_grid_patches(self, gpu: Properties) -> int:
         """Most patches of a grid that leave each one its least number of tetrahedra."""
@@ -186,7 +204,8 @@ class _PlanBuilder(NamedTuple):
         slots = self.vertices if patches == 1 else 4
         planes, spheres = len(self.values.planes), len(self.values.spheres)
         # two tetrahedra have at least five entries
-        least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, 5 * tets // 2, planes, spheres)
+        entries = 5 * tets // 2 + self.stencil_corners // patches
+        least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, entries, planes, spheres)
         return f"at least {least:,} B" if least > gpu.shared else ""
 
     def refuse_patch(self, pairs: int, interior: int) -> str:
@@ -280,17 +299,43 @@ def _level_plan(scene: _PlanBuilder, gpu: Properties, name: str) -> Plan:
 
 def _plan_that_fits(scene: _PlanBuilder, gpu: Properties, name: str, more: Callable[[int], int]) -> Plan:
     """Plan for "stream" or a multilevel solver; `more` gives the next number of patches to try."""
-    patches = min(scene.patches(name, gpu), scene.tets)
+    patches = min(scene.patches(name, gpu), scene.elements)
     while True:
         try:
             plan = replace(scene.plan("stream", patches), for_multilevel=name != "stream")
         except ValueError:  # more entries in a patch than 16 bits count
-            if patches == scene.tets:
+            if patches == scene.elements:
                 raise
         else:
-            if scene.shared_bytes(plan) <= gpu.shared or patches == scene.tets:
+            if scene.shared_bytes(plan) <= gpu.shared or patches == scene.elements:
                 return plan
-        patches = min(more(patches), scene.tets)
+        patches = min(more(patches), scene.elements)
+
+
+def _check_stencils(values: SceneValues, kernel: str, levels: bool) -> None:
+    """Refuse what scenes with stencils cannot have on a GPU."""
+    if not values.stencils:
+        return
+    if levels:
+        raise ValueError(
+            f"Simulator: solver must be Chebyshev() or Jacobi() for a scene with {OTHER_BODIES} on a GPU, got "
+            "Multilevel; it runs there for solids alone"
+        )
+    known = ("auto", "benchmark", *_STENCIL_KERNELS)
+    if kernel not in known:
+        raise ValueError(
+            f"Simulator: kernel must be {quoted_choices(known)} for a scene with {OTHER_BODIES}, got {kernel!r}; "
+            'leave it at "auto"'
+        )
+
+
+def _mixed_plans(scene: _PlanBuilder, gpu: Properties, batch: int | None) -> Iterator[Plan]:
+    """Plans that fit a scene with stencils, in the order of preference."""
+    plan, needed = _fused_plan(scene, "block", gpu, batch)
+    why = _requirements([f"block needs {needed}"], gpu)
+    if plan is not None:
+        yield replace(plan, why=why)
+    yield replace(_stream_plan(scene, gpu), why=why)
 
 
 def choose_plan(
@@ -319,6 +364,7 @@ def choose_plan(
         fastest: for "benchmark": chooses among a plan for every kernel that fits, see `kernel_benchmark`.
     """
     check_kernel(kernel)
+    _check_stencils(values, kernel, levels)
     scene = _PlanBuilder(values, dtype, progress)
     size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
     if levels:
@@ -332,6 +378,9 @@ def choose_plan(
             'Simulator: kernel="cluster" needs thread block clusters (NVIDIA compute capability 9.0), and this GPU has '
             'none; take "auto", "block", "grid" or "stream"'
         )
+    if values.stencils and kernel in ("auto", "benchmark"):
+        plans = _mixed_plans(scene, gpu, batch)
+        return next(plans) if kernel == "auto" else fastest(plans)
     if kernel == "benchmark":
         return fastest(_plans_that_fit(scene, gpu, 1 if batch is None else batch))
     if kernel == "auto" and batch is not None:
@@ -346,7 +395,8 @@ def choose_plan(
             return replace(plan, why=_choice_reason(kernel, requirements, gpu))
         if kernel == name:
             # later kernels need less
-            others = [other for other in KERNELS[KERNELS.index(name) + 1 :] if scene.is_candidate(other, gpu)]
+            known = _STENCIL_KERNELS if values.stencils else KERNELS
+            others = [other for other in known[known.index(name) + 1 :] if scene.is_candidate(other, gpu)]
             raise ValueError(
                 f"Simulator: kernel={kernel!r} does not fit this GPU: {_requirements(requirements, gpu)}; "
                 f"take {quoted_choices(('auto', *others))}"

@@ -14,13 +14,14 @@ from torch import Tensor
 from .. import _C
 from ..common.checks import plain_tensor
 from ..common.gpu import check_free_memory, free_memory, properties_of, unavailable_reason, visible_devices
+from ..common.tables import EFFECT_ROWS
 from ..ops.diagonal import pinned_vertices
 from ..scene.solvers import Multilevel
 from .compiled import CompiledScene
 from .cpu_plan import Plan, compile_plan, with_loose_components
 from .kernel_benchmark import fastest_plan
-from .kernel_choice import choose_plan
-from .material import material_of, material_rows
+from .kernel_choice import OTHER_BODIES, choose_plan
+from .material import dims_of, material_of, material_rows
 from .preconditioner import (
     ReferenceMaterial,
     has_preconditioner,
@@ -101,10 +102,10 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=compiled.progress)
-    if values.stencils or values.poisson is not None:
+    if values.poisson is not None:
         raise RuntimeError(
-            f"Simulator: device must be the CPU for scenes with Poisson's ratio, cloth, rods, springs, ties or fibres, "
-            f"which have no kernels for {device} yet; keep it there, or leave these out"
+            f"Simulator: device must be the CPU for scenes with Poisson's ratio, which has no kernels for {device}; "
+            "keep it there, or leave poisson out"
         )
     return choose_plan(
         values, dtype, properties_of(device), compiled.kernel,
@@ -131,7 +132,12 @@ def is_suitable(compiled: CompiledScene) -> bool:
 
 
 def _with_preconditioner(compiled: CompiledScene, plan: Plan, reference: ReferenceMaterial) -> Plan:
-    """Add a multilevel preconditioner to a plan. On a GPU only the stream kernel reads it."""
+    """Add a multilevel preconditioner to a plan. On a GPU only the stream kernel reads it, for solids alone."""
+    if plan.kernel is not None and compiled.has_stencils:
+        raise ValueError(
+            f'Simulator: adjoint="multilevel" needs a scene of solids alone on a GPU, got {OTHER_BODIES} too; '
+            'leave adjoint at "solver"'
+        )
     if plan.kernel not in (None, "stream"):
         raise ValueError(
             f'Simulator: adjoint="multilevel" needs kernel="stream" on a GPU, got kernel={compiled.kernel!r} '
@@ -207,14 +213,22 @@ def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.de
         device: the GPU.
     """
     real = torch.finfo(plan.dtype).bits // 8
-    levels = plan.level_sizes.numpy() if has_preconditioner(plan.arrays) else np.empty(0, dtype=np.int32)
-    planes, spheres, stiffness = (compiled.named[name] for name in ("planes", "spheres", "stiffness"))
-    own = stiffness.dim() == 2 and len(stiffness) == batch
+    none = np.empty(0, dtype=np.int32)
+    levels = plan.level_sizes.numpy() if has_preconditioner(plan.arrays) else none
+    stencils = plan.stencil_sizes.numpy() if compiled.has_stencils else none
+    planes, spheres = (compiled.named[name] for name in ("planes", "spheres"))
+
+    def own(name: str) -> bool:
+        array = compiled.named[name]
+        return array.dim() > dims_of(name) and len(array) == batch
+
+    effects = any(own(row.name) for row in EFFECT_ROWS if row.name in compiled.named)
     schedule: int = compiled.solver.settings()["schedule"]
     with torch.cuda.device(device):
         return _C.step_bytes(
-            real, plan.sizes.numpy(), levels, schedule, batch, planes.shape[-2], spheres.shape[-2], own
-        )
+            real, plan.sizes.numpy(), levels, stencils, schedule, batch, planes.shape[-2], spheres.shape[-2],
+            own("stiffness"), effects,
+        )  # fmt: skip
 
 
 def is_recording(device: torch.device) -> bool:

@@ -21,14 +21,36 @@ struct Cuda {
   }
 
   template <class T>
-  static void step(const DeviceStep<T>& call, const Tensor& like) {
-    const bool stream = call.plan.kernel == int(DeviceKernel::stream);
-    run(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
+  using Step = Mixed<DeviceStep<T>>;
+  template <class T>
+  using Field = Mixed<DeviceField<T>>;
+  template <class T>
+  using Conjugate = Mixed<DeviceConjugate<T>>;
+
+  template <class Call>
+  static void view_stencils(Mixed<Call>& call, at::TensorList arrays, const Place& place) {
+    call.stencils = device_stencils_view<typename Call::real>(arrays, call.plan.patches, place);
+  }
+  template <class Call>
+  static const int32* stencil_counts(const Mixed<Call>& call) {
+    return call.stencils.blocks > 0 ? call.stencils.stencil_sizes + stencil_size_count : nullptr;
   }
 
   template <class T>
-  static void field(const DeviceField<T>& call, const Tensor& like) {
-    run(like, call, field_bytes<T>, run_field<T>);
+  static void step(const Step<T>& call, const Tensor& like) {
+    const bool stream = call.plan.kernel == int(DeviceKernel::stream);
+    if (call.stencils.blocks > 0)
+      return run(like, call, mixed_step_bytes<T>,
+                 stream ? run_mixed_stream<T> : run_mixed_block<T>);
+    run<DeviceStep<T>>(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
+  }
+
+  template <class T>
+  static void field(const Field<T>& call, const Tensor& like) {
+    if (call.stencils.blocks > 0) return run(like, call, mixed_field_bytes<T>, run_mixed_field<T>);
+    // what belongs to effects is zero
+    if (call.field == pd::Field::effect_energy || call.field == pd::Field::effect_products) return;
+    run<DeviceField<T>>(like, call, field_bytes<T>, run_field<T>);
   }
 
   template <class T>
@@ -43,8 +65,10 @@ struct Cuda {
   }
 
   template <class T>
-  static void conjugate(const DeviceConjugate<T>& call, const Tensor& like) {
-    run(like, call, conjugate_bytes<T>, run_conjugate<T>);
+  static void conjugate(const Conjugate<T>& call, const Tensor& like) {
+    if (call.stencils.blocks > 0)
+      return run(like, call, mixed_conjugate_bytes<T>, run_mixed_conjugate<T>);
+    run<DeviceConjugate<T>>(like, call, conjugate_bytes<T>, run_conjugate<T>);
   }
 
   template <class T>

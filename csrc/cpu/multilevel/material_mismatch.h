@@ -12,7 +12,7 @@ namespace pd::inline PD_TARGET {
 template <class T, class Inertia>
 struct MismatchRunner {
   const Plan<T>& plan;
-  const Material<T>& material;
+  const StepCall<T>& call;
   std::int64_t environment;
   const Team& team;
   Range (*ranges)[ranges_count];  // one row a thread
@@ -20,10 +20,10 @@ struct MismatchRunner {
 
   template <class Visit>
   void each_element(const Visit& visit) const {
-    const MatrixStiffness<T> stiffness(material.stiffness, material.effects, environment);
+    const MatrixStiffness<T> stiffness(call.material.stiffness, call.effects, environment);
     for (std::int64_t t = team.begin(plan.tets); t < team.end(plan.tets); ++t)
       visit(stiffness(t), t);
-    each_stencil_stiffness(plan, material.effects, environment, team.begin(plan.stencil_blocks),
+    each_stencil_stiffness(plan, call.effects, environment, team.begin(plan.stencil_blocks),
                            team.end(plan.stencil_blocks), visit);
   }
 

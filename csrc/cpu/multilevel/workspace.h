@@ -32,7 +32,7 @@ struct MultilevelWork {
   MultilevelWork(const StepCall<typename Lanes::Scalar>& call, bool has_contacts, int threads)
       : cycle(call.plan.levels),
         corotation(call.plan, call.settings.schedule == ScheduleKind::corotated, has_contacts,
-                   call.material.effects.poisson.data != nullptr, threads),
+                   call.effects.poisson.data != nullptr, threads),
         chunks((call.plan.vertices + chunk - 1) / chunk) {
     const bool pairs = call.settings.learns();
     const std::int64_t n = call.plan.vertices, held = has_contacts ? n : 0;

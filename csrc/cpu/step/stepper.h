@@ -216,10 +216,10 @@ class Stepper {
       });
     const auto environment_of = [&](int lane) { return in_.environment(lane); };
     const auto set_weights = [&](WeightKind kind) {
-      sweep_.set_weights(call_.material.stiffness, call_.material.effects, kind, environment_of);
+      sweep_.set_weights(call_.material.stiffness, call_.effects, kind, environment_of);
     };
     set_weights(set_.weighted ? WeightKind::majoriser : WeightKind::matrix);
-    sweep_.set_stencil_numbers(call_.material.effects, environment_of);
+    sweep_.set_stencil_numbers(call_.effects, environment_of);
     team_.barrier();
     const Elements<SolidDiagonal, StencilDiagonal> diagonal{{}, {set_.weighted}};
     sweep_.run(0, diagonal, [&](std::int64_t i, const Value& force, Sum& sums) {

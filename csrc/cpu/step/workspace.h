@@ -72,14 +72,15 @@ struct Workspace {
   bool some_go_on = false;  // some environment moves in the next leg
 
   explicit Workspace(const StepCall<T>& call)
-      : Workspace(call.plan, call.material, shares_elasticity(call.material),
+      : Workspace(call.plan, call.material, call.effects,
+                  call.material.stiffness.stride == 0 && shares_effects(call.effects),
                   call.forces != nullptr) {}
 
   explicit Workspace(const FieldCall<T>& call)
-      : Workspace(call.plan, elastic(call.effects), true, false) {}
+      : Workspace(call.plan, {}, call.effects, true, false) {}
 
   explicit Workspace(const ConjugateCall<T>& call)
-      : Workspace(call.plan, elastic(call.effects), true, true) {}
+      : Workspace(call.plan, {}, call.effects, true, true) {}
 
   ElementWeights<T> weights() const { return {weight, pressure, shared_weight}; }
 
@@ -103,18 +104,14 @@ struct Workspace {
  private:
   static constexpr std::size_t alignment = 64;
 
-  static Material<T> elastic(const Effects<T>& effects) {
-    Material<T> material;
-    material.effects = effects;
-    return material;
-  }
-
-  Workspace(const Plan<T>& plan, const Material<T>& material, bool same_stiffness, bool forces) {
+  Workspace(const Plan<T>& plan, const Material<T>& material, const Effects<T>& effects,
+            bool same_stiffness, bool forces) {
+    const bool has_pressure = effects.poisson.data != nullptr;
     shared_weight = Lanes::environments == 1 || same_stiffness;
     part_count = plan.patches + (plan.shared + shared_chunk - 1) / shared_chunk;
-    arrange(plan, material, forces, nullptr);
+    arrange(plan, material, has_pressure, forces, nullptr);
     storage_ = allocate_zeroed(size_);
-    arrange(plan, material, forces, storage_.get());
+    arrange(plan, material, has_pressure, forces, storage_.get());
   }
 
   template <class Item>
@@ -123,7 +120,8 @@ struct Workspace {
     size_ += (count * sizeof(Item) + alignment - 1) / alignment * alignment;
   }
 
-  void arrange(const Plan<T>& plan, const Material<T>& material, bool forces, std::byte* base) {
+  void arrange(const Plan<T>& plan, const Material<T>& material, bool has_pressure, bool forces,
+               std::byte* base) {
     size_ = 0;
     for (Value** array : {&x, &velocity, &target, &u, &before}) place(*array, plan.vertices, base);
     place(force, forces ? plan.vertices : 0, base);
@@ -143,7 +141,6 @@ struct Workspace {
     place(spheres, material.spheres_count, base);
     const std::int64_t weights =
         std::int64_t(plan.blocks) * block_lanes * (shared_weight ? 1 : Lanes::environments);
-    const bool has_pressure = material.effects.poisson.data != nullptr;
     place(weight, weights, base);
     place(pressure, has_pressure ? weights : 0, base);
     if (!has_pressure) pressure = nullptr;

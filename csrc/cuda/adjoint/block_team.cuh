@@ -27,6 +27,8 @@ struct ConjugateMemory {
 
 template <class T>
 struct ConjugateTeams {
+  using real = T;
+  static constexpr bool has_stencils = false;
   DeviceConjugate<T> call;
   FieldWork<T> product;  // for its weights
   ConjugateMemory<T> memory;
@@ -40,16 +42,22 @@ struct ConjugateTeams {
   PD_HD int product_parts() const { return call.plan.patches + parts_of(call.plan.shared); }
 };
 
-// `WithLevels`: with the multilevel preconditioner. `Computed`: see rest_of.
-template <class T, bool WithLevels, bool Computed>
+// `Work`: ConjugateTeams, or one that adds to it. `WithLevels`: with the multilevel preconditioner. `Computed`: see
+// rest_of.
+template <class Work, bool WithLevels, bool Computed>
 class ConjugateTeam {
+ protected:
+  using T = typename Work::real;
+
+ private:
   static_assert(conjugate_threads<T> % (most_parts * warp_size) == 0);
 
  public:
-  __device__ ConjugateTeam(const ConjugateTeams<T>& work, const ConjugateMemory<T>& memory,
+  __device__ ConjugateTeam(const Work& work, const ConjugateMemory<T>& memory,
                            std::int64_t environment, BlockTeam& team, std::byte* shared,
                            WarpSums& warp_sums, Quad<T>* cycle_sums)
-      : call_(work.call),
+      : work_(work),
+        call_(work.call),
         plan_(work.call.plan),
         m_(memory),
         environment_(environment),
@@ -260,7 +268,12 @@ class ConjugateTeam {
       slots_.set(s, vec3(m_.x[i]) - anchor, what(i));
     }
     __syncthreads();
-    each_pair<2>(patch, slots_, rest_of<Computed>(patch), weights_, entries_, SolidHessian{});
+    if constexpr (Work::has_stencils) {
+      each_pair_and_stencil<2>(patch, slots_, rest_of<Computed>(patch), weights_, work_.stencils,
+                               environment_, false, entries_, SolidHessian{});
+    } else {
+      each_pair<2>(patch, slots_, rest_of<Computed>(patch), weights_, entries_, SolidHessian{});
+    }
     __syncthreads();
     for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
       const int slot = patch.first_slot + s;
@@ -307,6 +320,7 @@ class ConjugateTeam {
     each_part(0, plan_.vertices, write, [](int) {});
   }
 
+  const Work& work_;
   const DeviceConjugate<T>& call_;
   const DevicePlan<T>& plan_;
   const ConjugateMemory<T>& m_;

@@ -14,6 +14,7 @@ constexpr int field_threads = 256;
 
 template <class T>
 struct FieldWork {
+  using real = T;
   DeviceField<T> field;
   T* weights;             // [batch or 1, blocks, 2, 32] w V
   Quad<T>* shared_force;  // [batch or teams, slots]
@@ -92,18 +93,12 @@ struct PatchFields {
   }
 };
 
-// Fields: vectors that an element reads per vertex. Numbers: values that a vertex gets.
-template <bool Computed, class Element, int Fields, int Numbers, class T>
-__global__ void __launch_bounds__(field_threads)
-    field_vertices(const __grid_constant__ FieldWork<T> work) {
-  extern __shared__ __align__(16) std::byte shared[];
+// Writes the sums of a patch's entries: to interior vertices, and for field_shared.
+template <int Numbers, int Fields, class T>
+__device__ void write_patch(const FieldWork<T>& work, const PatchFields<Fields, T>& fields) {
   const DevicePlan<T>& plan = work.field.plan;
-  const PatchFields<Fields, T> fields(work.field, shared);
   const std::int64_t environment = fields.environment;
   const Patch<T>& patch = fields.patch;
-  each_pair<Fields>(patch, fields, rest_of<Computed>(patch), work.weights_of(environment),
-                    fields.entries, Element{});
-  __syncthreads();
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const int slot = patch.first_slot + s;
     const Vec3<T> force = sum_entries(fields.entries, plan.slot_row[slot]);
@@ -113,6 +108,19 @@ __global__ void __launch_bounds__(field_threads)
       work.shared_force[environment * plan.slots + slot] = quad(force);
     }
   }
+}
+
+// Fields: vectors that an element reads per vertex. Numbers: values that a vertex gets.
+template <bool Computed, class Element, int Fields, int Numbers, class T>
+__global__ void __launch_bounds__(field_threads)
+    field_vertices(const __grid_constant__ FieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const PatchFields<Fields, T> fields(work.field, shared);
+  const Patch<T>& patch = fields.patch;
+  each_pair<Fields>(patch, fields, rest_of<Computed>(patch), work.weights_of(fields.environment),
+                    fields.entries, Element{});
+  __syncthreads();
+  write_patch<Numbers>(work, fields);
 }
 
 template <int Numbers, class T>
@@ -185,9 +193,10 @@ std::int64_t field_bytes(const DeviceField<T>& field) {
   return arena.size();
 }
 
-template <class T>
-void launch_field(void (*kernel)(FieldWork<T>), const FieldWork<T>& work, int fields,
-                  cudaStream_t stream) {
+// `Work`: FieldWork, or one that adds to it
+template <class Work>
+void launch_field(void (*kernel)(Work), const Work& work, int fields, cudaStream_t stream) {
+  using T = typename Work::real;
   const DevicePlan<T>& plan = work.field.plan;
   const std::size_t bytes =
       pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, fields);
@@ -197,14 +206,20 @@ void launch_field(void (*kernel)(FieldWork<T>), const FieldWork<T>& work, int fi
   check(cudaGetLastError());
 }
 
-template <bool Computed, class Element, int Fields, int Numbers, class T>
-void run_vertices(const FieldWork<T>& work, cudaStream_t stream) {
-  launch_field(field_vertices<Computed, Element, Fields, Numbers, T>, work, Fields, stream);
+// Adds up what patches have on shared vertices.
+template <int Numbers, class T>
+void run_shared(const FieldWork<T>& work, cudaStream_t stream) {
   if (work.field.plan.shared == 0) return;
   const std::int64_t blocks = (work.field.plan.shared + field_threads - 1) / field_threads;
   field_shared<Numbers, T>
       <<<blocks_of(work.field.batch * blocks), field_threads, 0, stream>>>(work);
   check(cudaGetLastError());
+}
+
+template <bool Computed, class Element, int Fields, int Numbers, class T>
+void run_vertices(const FieldWork<T>& work, cudaStream_t stream) {
+  launch_field(field_vertices<Computed, Element, Fields, Numbers, T>, work, Fields, stream);
+  run_shared<Numbers>(work, stream);
 }
 
 template <bool Computed, class T>
@@ -232,6 +247,8 @@ void run_field_with(const FieldWork<T>& work, cudaStream_t stream) {
       return launch_field(field_elements<Computed, false, T>, work, 1, stream);
     case Field::element_energy_product:
       return launch_field(field_elements<Computed, true, T>, work, 2, stream);
+    default:
+      return;  // only run_mixed_field has the others
   }
 }
 

@@ -5,9 +5,9 @@
 
 namespace pd {
 
-template <class T, bool WithLevels, bool Computed>
-class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
-  using Base = ConjugateTeam<T, WithLevels, Computed>;
+template <class Work, bool WithLevels, bool Computed>
+class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
+  using Base = ConjugateTeam<Work, WithLevels, Computed>;
   using Base::call_;
   using Base::cycle_;
   using Base::direction_pending_;
@@ -22,6 +22,7 @@ class FrictionTeam : ConjugateTeam<T, WithLevels, Computed> {
   using Base::team_;
   using Base::unit_;
   using Base::warp_sums_;
+  using typename Base::T;
 
  public:
   using Base::Base;

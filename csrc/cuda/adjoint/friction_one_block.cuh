@@ -13,21 +13,23 @@ struct FrictionVectors {
 };
 
 // One environment, with its fields in shared memory. A thread keeps its vertices in all loops.
-template <class T>
+// `Work`: as for conjugate_block.
+template <class Work>
 class FrictionBlock {
+  using T = typename Work::real;
+
  public:
-  __device__ FrictionBlock(const FieldWork<T>& product, const DeviceConjugate<T>& call,
-                           const FrictionVectors<T>& vectors, T* image,
-                           const PatchFields<2, T>& fields, T unit, WarpSums& warp_sums)
-      : product_(product),
-        call_(call),
-        v_(vectors),
-        image_(image),
+  __device__ FrictionBlock(const Work& work, const PatchFields<2, T>& fields, T unit,
+                           WarpSums& warp_sums)
+      : work_(work),
+        call_(work.call),
+        v_(work.friction),
+        image_(work.image),
         fields_(fields),
         per_unit_(T(1) / unit),
         warp_sums_(warp_sums),
-        inertia_(call.inertia.of(blockIdx.x)),
-        inverse_(call.inverse.of(blockIdx.x)) {}
+        inertia_(work.call.inertia.of(blockIdx.x)),
+        inverse_(work.call.inverse.of(blockIdx.x)) {}
 
   // Replaces the solution y by the multiplier G^T y.
   __device__ void run(FrictionSolve& friction) const {
@@ -63,8 +65,7 @@ class FrictionBlock {
           s, transposed_friction(z(stage, i, at), call_.sliding + slide_count * at));
     });
     __syncthreads();
-    each_pair<2>(fields_.patch, fields_, rest_of<false>(fields_.patch),
-                 product_.weights_of(blockIdx.x), fields_.entries, SolidHessian{});
+    multiply_elements(work_, fields_);
     __syncthreads();
   }
 
@@ -127,7 +128,7 @@ class FrictionBlock {
     });
   }
 
-  const FieldWork<T>& product_;
+  const Work& work_;
   const DeviceConjugate<T>& call_;
   const FrictionVectors<T>& v_;
   T* image_;

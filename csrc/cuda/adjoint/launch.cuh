@@ -22,17 +22,18 @@ __device__ ConjugateMemory<T> memory_of_team(const ConjugateTeams<T>& work, int 
   return m;
 }
 
-// `WithFriction`: adds the solve with friction.
-template <class T, bool WithLevels, bool Computed, bool WithFriction>
-__global__ void __launch_bounds__(conjugate_threads<T>)
-    conjugate_teams(const __grid_constant__ ConjugateTeams<T> work) {
+// `WithFriction`: adds the solve with friction. `Work`: ConjugateTeams, or one that adds to it.
+template <class Work, bool WithLevels, bool Computed, bool WithFriction>
+__global__ void __launch_bounds__(conjugate_threads<typename Work::real>)
+    conjugate_teams(const __grid_constant__ Work work) {
+  using T = typename Work::real;
   extern __shared__ __align__(16) std::byte shared[];
   __shared__ WarpSums warp_sums;
   __shared__ Quad<T> cycle_sums[WithLevels ? 4 * conjugate_threads<T> / warp_size : 1];
   const int number = int(blockIdx.x) / work.blocks;
   BlockTeam team(int(blockIdx.x) % work.blocks, work.blocks, work.counter + number);
-  using Team = std::conditional_t<WithFriction, FrictionTeam<T, WithLevels, Computed>,
-                                  ConjugateTeam<T, WithLevels, Computed>>;
+  using Team = std::conditional_t<WithFriction, FrictionTeam<Work, WithLevels, Computed>,
+                                  ConjugateTeam<Work, WithLevels, Computed>>;
   const ConjugateMemory<T> of_team = memory_of_team(work, number);
   for (std::int64_t e = number; e < work.call.batch; e += work.teams) {
     ConjugateMemory<T> memory = of_team;
@@ -59,8 +60,14 @@ struct ConjugateLaunch {
   Teams teams;
 
   explicit ConjugateLaunch(const DeviceConjugate<T>& call)
-      : kernel(call.friction ? kernel_for<true>(call.plan) : kernel_for<false>(call.plan)),
-        threads(threads_of(call.plan)),
+      : ConjugateLaunch(call,
+                        call.friction ? kernel_for<true>(call.plan) : kernel_for<false>(call.plan),
+                        call.plan.most_pairs) {}
+
+  // `pairs`: of tetrahedra, or items that threads take like them
+  ConjugateLaunch(const DeviceConjugate<T>& call, const void* function, int pairs)
+      : kernel(function),
+        threads(threads_of(call.plan, pairs)),
         shared(pass_shared_bytes(sizeof(T), call.plan.most_slots, call.plan.most_entries, 2)),
         teams(std::min(call.batch, std::max<std::int64_t>(1, most_vertices / call.plan.vertices)),
               resident(), useful(call.plan)) {}
@@ -79,7 +86,8 @@ struct ConjugateLaunch {
   }
   template <bool WithLevels, bool Computed, bool WithFriction>
   static const void* function() {
-    return reinterpret_cast<const void*>(conjugate_teams<T, WithLevels, Computed, WithFriction>);
+    return reinterpret_cast<const void*>(
+        conjugate_teams<ConjugateTeams<T>, WithLevels, Computed, WithFriction>);
   }
   int resident() const {
     const int blocks = resident_blocks(kernel, threads, shared);
@@ -89,9 +97,9 @@ struct ConjugateLaunch {
   // Only the plan decides, since the number of threads sets the order of sums. More threads than
   // pairs would keep the patches of a small mesh from running in parallel. The preconditioner is
   // faster with few blocks of many threads.
-  static int threads_of(const DevicePlan<T>& plan) {
+  static int threads_of(const DevicePlan<T>& plan, int pairs) {
     constexpr int most = conjugate_threads<T>, least = 64;
-    return plan.levels.there() ? most : std::clamp(int(whole_warps(plan.most_pairs)), least, most);
+    return plan.levels.there() ? most : std::clamp(int(whole_warps(pairs)), least, most);
   }
   int useful(const DevicePlan<T>& plan) const {
     const int levels = plan.levels.there() ? useful_blocks(plan.levels, threads) : 1;
@@ -123,6 +131,17 @@ ConjugateTeams<T> arrange_teams(Arena& arena, const DeviceConjugate<T>& call,
   return work;
 }
 
+// `Work`: ConjugateTeams, or one that adds to it
+template <class T, class Work>
+void launch_solve(const ConjugateLaunch<T>& launch, Work& work, cudaStream_t stream) {
+  const DeviceConjugate<T> call = work.call;
+  const int most = launch.most_iterations(call);
+  for (std::int64_t done = 0; done < call.iterations; done += most) {
+    work.call.iterations = int(std::min<std::int64_t>(most, call.iterations - done));
+    launch_teams(launch.kernel, work, work.counter, launch.threads, launch.shared, stream);
+  }
+}
+
 template <class T>
 void run_conjugate_teams(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
   const ConjugateLaunch<T> launch(call);
@@ -133,11 +152,7 @@ void run_conjugate_teams(const DeviceConjugate<T>& call, void* memory, cudaStrea
   } else {
     compute_field_weights<false>(work.product, stream);
   }
-  const int most = launch.most_iterations(call);
-  for (std::int64_t done = 0; done < call.iterations; done += most) {
-    work.call.iterations = int(std::min<std::int64_t>(most, call.iterations - done));
-    launch_teams(launch.kernel, work, work.counter, launch.threads, launch.shared, stream);
-  }
+  launch_solve(launch, work, stream);
 }
 
 }  // namespace pd

@@ -11,18 +11,27 @@ namespace pd {
 
 template <class T>
 struct ConjugateBlock {
+  using real = T;
   DeviceConjugate<T> call;
   FieldWork<T> product;  // with the search direction
   T* image;              // [batch, vertices, 3], the product
   FrictionVectors<T> friction;
 };
 
+// Writes the elastic product of an environment's direction to the entries.
+template <class T>
+PD_DEVICE void multiply_elements(const ConjugateBlock<T>& work, const PatchFields<2, T>& fields) {
+  each_pair<2>(fields.patch, fields, rest_of<false>(fields.patch),
+               work.product.weights_of(blockIdx.x), fields.entries, SolidHessian{});
+}
+
 // All iterations of one environment, independent of the others and without host synchronisation. A
 // thread keeps its vertices in all loops, so it reads its own writes to global memory.
-// `WithFriction`: adds the solve with friction.
-template <class T, bool WithFriction>
-__global__ void __launch_bounds__(conjugate_threads<T>)
-    conjugate_block(const __grid_constant__ ConjugateBlock<T> work) {
+// `WithFriction`: adds the solve with friction. `Work`: ConjugateBlock, or one that adds to it.
+template <class Work, bool WithFriction>
+__global__ void __launch_bounds__(conjugate_threads<typename Work::real>)
+    conjugate_block(const __grid_constant__ Work work) {
+  using T = typename Work::real;
   extern __shared__ __align__(16) std::byte shared[];
   __shared__ WarpSums warp_sums;
   const DeviceConjugate<T>& call = work.call;
@@ -81,8 +90,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
   int products = 0;
   while (products < call.iterations && numbers.active) {
     ++products;
-    each_pair<2>(fields.patch, fields, rest_of<false>(fields.patch),
-                 work.product.weights_of(environment), fields.entries, SolidHessian{});
+    multiply_elements(work, fields);
     __syncthreads();
     double curvature[1] = {0};
     each_slot([&](int s, int i, std::int64_t at) {
@@ -120,8 +128,7 @@ __global__ void __launch_bounds__(conjugate_threads<T>)
     if (largest[1] > 0 && continues_with_friction(numbers, call.tolerance)) {
       FrictionSolve friction(nullptr, numbers.scale);
       friction.begin(products, adjoint_iterations);
-      FrictionBlock<T>(work.product, call, work.friction, work.image, fields, unit, warp_sums)
-          .run(friction);
+      FrictionBlock<Work>(work, fields, unit, warp_sums).run(friction);
       if (threadIdx.x == 0) friction.write(call.friction + environment * friction_count);
     }
   }
@@ -146,13 +153,13 @@ ConjugateBlock<T> arrange_block(Arena& arena, const DeviceConjugate<T>& call) {
   return work;
 }
 
-template <class T>
-void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
-  Arena arena(memory);
-  const ConjugateBlock<T> work = arrange_block(arena, call);
-  const DevicePlan<T>& plan = call.plan;
-  compute_field_weights<false>(work.product, stream);
-  const auto kernel = call.friction ? conjugate_block<T, true> : conjugate_block<T, false>;
+// `pairs`: of tetrahedra, or items that threads take like them
+template <class Work>
+void launch_block(const Work& work, int pairs, cudaStream_t stream) {
+  using T = typename Work::real;
+  const auto kernel =
+      work.call.friction ? conjugate_block<Work, true> : conjugate_block<Work, false>;
+  const DevicePlan<T>& plan = work.call.plan;
   const std::size_t bytes = pass_shared_bytes(sizeof(T), plan.most_slots, plan.most_entries, 2);
   // Half as many threads if two blocks then share a multiprocessor, unless the plan is for one
   // environment. The batch of this call has no influence, since the number of threads sets the
@@ -161,10 +168,18 @@ void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStrea
   const bool share = plan.environments != 1 && resident_blocks(function, conjugate_threads<T> / 2,
                                                                bytes) >= 2 * multiprocessors();
   const int most = share ? conjugate_threads<T> / 2 : conjugate_threads<T>;
-  const int threads = std::min(int(whole_warps(plan.most_pairs)), most);
+  const int threads = std::min(int(whole_warps(pairs)), most);
   if (resident_blocks(function, threads, bytes) == 0) refuse_shared_memory(bytes);
   kernel<<<blocks_of(work.call.batch), threads, bytes, stream>>>(work);
   check(cudaGetLastError());
+}
+
+template <class T>
+void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStream_t stream) {
+  Arena arena(memory);
+  const ConjugateBlock<T> work = arrange_block(arena, call);
+  compute_field_weights<false>(work.product, stream);
+  launch_block(work, call.plan.most_pairs, stream);
 }
 
 }  // namespace pd

@@ -62,6 +62,24 @@ std::int64_t stream_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_stream(const DeviceStep<T>& call, void* memory, Stream stream);
 
+// The same for scenes with stencils, by the kernels block and stream.
+template <class T>
+using MixedStep = Mixed<DeviceStep<T>>;
+
+template <class T>
+std::int64_t mixed_block_bytes(const MixedStep<T>& call);
+template <class T>
+void run_mixed_block(const MixedStep<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t mixed_stream_bytes(const MixedStep<T>& call);
+template <class T>
+void run_mixed_stream(const MixedStep<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t mixed_step_bytes(const MixedStep<T>& call) {
+  return call.plan.kernel == int(DeviceKernel::stream) ? mixed_stream_bytes(call)
+                                                       : mixed_block_bytes(call);
+}
+
 // Device memory for a step of any kernel.
 template <class T>
 std::int64_t step_bytes(const DeviceStep<T>& call) {
@@ -72,17 +90,31 @@ template <class T>
 using DeviceField = FieldCall<T, DevicePlan<T>>;
 
 template <class T>
+using MixedField = Mixed<DeviceField<T>>;
+
+template <class T>
 std::int64_t field_bytes(const DeviceField<T>& call);
 template <class T>
 void run_field(const DeviceField<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t mixed_field_bytes(const MixedField<T>& call);
+template <class T>
+void run_mixed_field(const MixedField<T>& call, void* memory, Stream stream);
 
 template <class T>
 using DeviceConjugate = ConjugateCall<T, DevicePlan<T>>;
 
 template <class T>
+using MixedConjugate = Mixed<DeviceConjugate<T>>;
+
+template <class T>
 std::int64_t conjugate_bytes(const DeviceConjugate<T>& call);
 template <class T>
 void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t mixed_conjugate_bytes(const MixedConjugate<T>& call);
+template <class T>
+void run_mixed_conjugate(const MixedConjugate<T>& call, void* memory, Stream stream);
 
 template <class T>
 using DeviceAdjointSystem = AdjointSystemCall<T, DevicePlan<T>>;

@@ -3,6 +3,7 @@
 #include "cuda/common/inputs.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/team.h"
+#include "cuda/elements/stencils.h"
 #include "cuda/fused/halo.h"
 #include "cuda/rigid/rounds.h"
 #include "views/shared_memory.h"
@@ -35,6 +36,12 @@ struct FusedCall {
   FusedScratch<T> scratch;
   int teams;
   int kept;  // vertex arrays in shared memory
+};
+
+// The same for a scene with stencils.
+template <class T>
+struct MixedFusedCall : FusedCall<T> {
+  StencilWork<T> stencils;
 };
 
 // Shared memory of a block outside a cluster.

@@ -6,22 +6,26 @@
 namespace pd::inline PD_TARGET {
 
 // Of all patches that compute a tetrahedron, one counts its energy.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE bool FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::counts(
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE bool FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::counts(
     int number, T tet_energy) const {
   if (OnePerThread || number == int(threadIdx.x)) return counts_;
   return !(tet_energy == T(0)) && counts_energy(number);
 }
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE bool FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::counts_energy(
-    int number) const {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE bool FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
+                           HasStencils>::counts_energy(int number) const {
   const PairPlace place = place_of(patch_, min(number / 2, patch_.pairs - 1));
   return plan_.pair_tet[place.in(2) + number % 2 * pair_lanes] >= 0;
 }
 
 // Origin of the positions: the same for all patches of a cluster, since they exchange positions.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::anchor_of_step() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE Vec3<T>
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::anchor_of_step() {
   if constexpr (!Clustered) return vec3(v_.x[0]);
   if (just_loaded_) {
     just_loaded_ = false;
@@ -35,15 +39,19 @@ PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::an
   return read3(anchor);
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::wait_for_positions() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::wait_for_positions() {
   if (waited_ != round_) halo_.wait(round_);
   waited_ = round_;
 }
 
 // Loads the iterate into registers, where it stays during the iterations.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_iterate() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::load_iterate() {
   const int own = OwnHalo::vertex();
   if (own >= patch_.interior) return;
   loaded_ = v_.load(own);
@@ -51,8 +59,10 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_
   in_registers_ = true;
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::store_iterate() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::store_iterate() {
   if (in_registers_ && is_first()) {
     v_.set(item_.slot, loaded_.u);
     v_.set_before(item_.slot, loaded_.before);
@@ -61,8 +71,10 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::store
 }
 
 // Sends own vertices that something other than an iteration has moved.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::send_positions() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::send_positions() {
   __syncthreads();
   wait_for_positions();
   ++round_;
@@ -76,9 +88,11 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::send_
 // Cluster variant of iterate(). It ends without a barrier; the next iteration begins by waiting for
 // positions. Data that warps write before the barrier and read after it is double-buffered by the
 // parity of the iteration.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
 template <bool Stops>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::iterate_own(int k) {
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::iterate_own(
+    int k) {
   const bool guard = set_.schedule == ScheduleKind::guarded && k % guard_period == 0;
   if (moved_) {
     send_positions();
@@ -140,9 +154,10 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::itera
 }
 
 // Cluster variant of pass(), for visits that move no vertex.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
 template <class Element, class Visit>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::pass_own(
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::pass_own(
     const Element& element, const Visit& visit) {
   if (moved_) send_positions();
   wait_for_positions();

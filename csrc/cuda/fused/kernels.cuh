@@ -24,7 +24,7 @@ template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InSha
 __global__ void __launch_bounds__(Threads, 1)
     fused_step(const __grid_constant__ FusedCall<T> call) {
   extern __shared__ __align__(16) std::byte shared[];
-  FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared> runner(call, shared);
+  FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, false> runner(call, shared);
   const int team = Kind != Blocks::one ? int(blockIdx.x) / call.step.plan.patches : int(blockIdx.x);
   for (std::int64_t e = team; e < call.step.batch; e += call.teams) runner.rollout(e);
   // no block may exit while others can still write to its shared memory

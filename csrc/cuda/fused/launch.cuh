@@ -45,7 +45,6 @@ struct FusedLaunch {
   const void* function() const { return reinterpret_cast<const void*>(kernel); }
 
  private:
-  void form_block(const DeviceStep<T>& step);
   void form_clusters(const DeviceStep<T>& step);
   void keep_vertices(const DeviceStep<T>& step);
 };
@@ -82,24 +81,53 @@ constexpr int most_fitted_rounds = 3;
 // The best shape for a mesh and its shared memory. It serves as many environments as fit on a
 // multiprocessor, or those of the plan if they are fewer. The batch of a call has no influence,
 // so an environment gives the same bits alone and in any batch.
+//
+// `pairs`: tetrahedra's pairs, or items that threads take like them.
 template <class T>
-BlockShape block_shape(const DevicePlan<T>& plan, std::size_t shared) {
+BlockShape block_shape(int pairs, int environments, std::size_t shared) {
   BlockShape best, cheapest;
   if (shared > shared_memory_per_block()) return best;
   const int fit = int(shared_memory_per_multiprocessor() / (shared + reserved_shared_bytes));
   for (int threads = warp_size; threads <= resident_threads<T>; threads += warp_size) {
     const int per_multiprocessor = std::min(fit, resident_threads<T> / threads);
-    const int rounds = (plan.most_pairs + threads - 1) / threads;
-    BlockShape shape = {threads, per_multiprocessor,
-                        double(per_multiprocessor) * plan.most_pairs / rounds};
+    const int rounds = (pairs + threads - 1) / threads;
+    BlockShape shape = {threads, per_multiprocessor, double(per_multiprocessor) * pairs / rounds};
     if (shape.rank() > best.rank()) best = shape;
-    const bool few = plan.environments > 0 && plan.environments <= per_multiprocessor;
+    const bool few = environments > 0 && environments <= per_multiprocessor;
     if (!few || rounds > most_fitted_rounds) continue;
-    shape.cost = shape_cost(plan.environments, threads / warp_size, rounds);
+    shape.cost = shape_cost(environments, threads / warp_size, rounds);
     if (shape.cost < cheapest.cost) cheapest = shape;
   }
   return cheapest.per_multiprocessor > 0 ? cheapest : best;
 }
+
+// A block with one environment. It keeps as many arrays in shared memory as possible without lower occupancy or higher
+// cost.
+struct BlockForm {
+  int threads, kept = 1;  // vertex arrays in shared memory
+  std::size_t shared;
+
+  template <class T>
+  BlockForm(const DeviceStep<T>& step, int pairs) : shared(fused_shared_bytes(step)) {
+    const std::size_t each = sizeof(Quad<T>) * step.plan.most_slots;
+    const std::size_t begin = vertices_begin(step, false);
+    const auto shape_with = [&](std::size_t bytes) {
+      return block_shape<T>(pairs, step.plan.environments, bytes);
+    };
+    const BlockShape least = shape_with(shared);
+    BlockShape taken = least;
+    for (int arrays = 2; least.per_multiprocessor > 0 && arrays <= block_arrays; ++arrays) {
+      const BlockShape shape = shape_with(begin + (arrays - 1) * each);
+      if (shape.is_worse_than(least)) break;
+      taken = shape;
+      kept = arrays;
+      shared = begin + (arrays - 1) * each;
+    }
+    threads = taken.threads;
+  }
+
+  bool in_shared() const { return kept == block_arrays; }
+};
 
 // Threads of a block with one patch: one per tetrahedron and slot, up to a limit, plus a leading
 // warp without pairs.
@@ -126,7 +154,11 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
   }
   shared = fused_shared_bytes(step);
   if (kind == Blocks::one) {
-    form_block(step);
+    const BlockForm form(step, step.plan.most_pairs);
+    threads = form.threads;
+    kept = form.kept;
+    shared = form.shared;
+    kernel = fused_kernel(step, kind, form.in_shared(), threads);
   } else {
     threads = patch_threads(step.plan);
     keep_vertices(step);
@@ -141,25 +173,6 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
         std::to_string(shared) + " bytes of shared memory at once, and the plan has " +
         std::to_string(patches) + " patches; build the simulator with kernel=\"stream\"");
   teams = int(std::min<std::int64_t>(step.batch, resident / patches));
-}
-
-// Keeps as many arrays in shared memory as possible without lower occupancy or higher cost.
-template <class T>
-void FusedLaunch<T>::form_block(const DeviceStep<T>& step) {
-  const std::size_t each = sizeof(Quad<T>) * step.plan.most_slots;
-  const std::size_t begin = vertices_begin(step, false);
-  const BlockShape least = block_shape(step.plan, shared);
-  BlockShape taken = least;
-  kept = 1;
-  for (int arrays = 2; least.per_multiprocessor > 0 && arrays <= block_arrays; ++arrays) {
-    const BlockShape shape = block_shape(step.plan, begin + (arrays - 1) * each);
-    if (shape.is_worse_than(least)) break;
-    taken = shape;
-    kept = arrays;
-    shared = begin + (arrays - 1) * each;
-  }
-  threads = taken.threads;
-  kernel = fused_kernel(step, kind, kept == block_arrays, threads);
 }
 
 // Few patches with distributed shared memory. The batch has no influence here either.
@@ -205,8 +218,8 @@ void FusedLaunch<T>::keep_vertices(const DeviceStep<T>& step) {
   if (kept > 0) shared = begin + kept * each;
 }
 
-template <class T>
-FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const FusedLaunch<T>& launch) {
+template <class T, class Launch>
+FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const Launch& launch) {
   const DevicePlan<T>& plan = step.plan;
   const bool grid = launch.kind == Blocks::grid;
   const std::int64_t teams = launch.teams;

@@ -56,8 +56,10 @@ PD_DEVICE_COLD TeamSums<Kind> find_motions(MotionFinder<T, HasContacts, Kind> fi
   return finder.sums;
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::align_pieces() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::align_pieces() {
   const bool first = !started_;
   started_ = true;
   if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;

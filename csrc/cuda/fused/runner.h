@@ -13,6 +13,7 @@
 #include "cuda/common/vertices.h"
 #include "cuda/elements/pairs_per_thread.h"
 #include "cuda/elements/prefetched_pairs.h"
+#include "cuda/elements/stencils.h"
 #include "cuda/elements/tet_per_lane.h"
 #include "cuda/fused/call.h"
 #include "cuda/fused/halo.h"
@@ -28,8 +29,13 @@ namespace pd::inline PD_TARGET {
 // `InShared`, one patch: the arrays that iterations read fit in shared memory. Several patches: all
 // arrays fit, and each thread has at most one slot and, in float32, one tetrahedron. Cluster: in
 // addition, a patch has so few vertices of its own that each gets eight lanes instead of four.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+//
+// `HasStencils`, one patch: the scene has other elements than tetrahedra, or no tetrahedra.
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
 class FusedRunner {
+  static_assert(!HasStencils || Kind == Blocks::one);
+  using Call = std::conditional_t<HasStencils, MixedFusedCall<T>, FusedCall<T>>;
   static constexpr bool Many = Kind != Blocks::one;  // several patches per environment
   static constexpr bool Clustered = Kind == Blocks::cluster;
   static constexpr bool OnePerThread = (InShared || Clustered) && near_once(sizeof(T));
@@ -43,6 +49,14 @@ class FusedRunner {
   using OwnHalo = Halo<T, InShared ? 8 : 4>;
   using LoadedVertex = typename Vertices<T, HasContacts>::LoadedVertex;
 
+  struct Stencils {
+    const StencilWork<T>& work;
+    PD_DEVICE explicit Stencils(const Call& call) : work(call.stencils) {}
+  };
+  struct NoStencils {
+    PD_DEVICE explicit NoStencils(const Call&) {}
+  };
+
   // A slot, as one thread updates it in a pass.
   struct WorkItem {
     int slot, row;
@@ -53,8 +67,9 @@ class FusedRunner {
 
  public:
   // `shared`: size from FusedLaunch
-  PD_DEVICE FusedRunner(const FusedCall<T>& call, std::byte* shared)
-      : call_(call.step),
+  PD_DEVICE FusedRunner(const Call& call, std::byte* shared)
+      : stencils_(call),
+        call_(call.step),
         plan_(call.step.plan),
         set_(call.step.settings),
         index_(Many ? int(blockIdx.x) % call.step.plan.patches : 0),
@@ -273,7 +288,13 @@ class FusedRunner {
       const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
         x[0] = at_corner(position_, corner);
       };
-      return each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_, element);
+      if constexpr (HasStencils) {
+        return each_pair_and_stencil<1>(patch_, read, rest_of<false>(patch_), weights(),
+                                        stencils_.work, in_.environment, set_.weighted, entries_,
+                                        element);
+      } else {
+        return each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_, element);
+      }
     }
   }
 
@@ -426,6 +447,7 @@ class FusedRunner {
     if (index_ == 0 && threadIdx.x == 0) in_.write_info(record, control_.progress);
   }
 
+  std::conditional_t<HasStencils, Stencils, NoStencils> stencils_;
   const DeviceStep<T>& call_;
   const DevicePlan<T>& plan_;
   const Settings& set_;

@@ -6,8 +6,9 @@
 namespace pd::inline PD_TARGET {
 
 // Sets the pointers to shared memory, and to global memory for arrays that do not fit.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::lay_out(
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::lay_out(
     const FusedCall<T>& call, std::byte* shared) {
   if constexpr (Clustered) {
     energies_ = reinterpret_cast<double*>(shared + cluster_energy_begin);
@@ -38,8 +39,10 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::lay_o
 }
 
 // Per-thread data of the patch, constant for the call.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::init(std::byte* shared) {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::init(
+    std::byte* shared) {
   if constexpr (!InShared) {
     const int threads = blockDim.x;
     outer_pairs_ = min((patch_.outer + threads - 1) / threads * threads, outer_pairs_);
@@ -54,8 +57,9 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::init(
   }
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::load() {
   if (threadIdx.x == 0) in_.read_contacts(planes_, spheres_);
   contacts_ = {planes_, spheres_, call_.material.planes_count, call_.material.spheres_count};
   each_slot([&](int s) {
@@ -74,8 +78,10 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load(
   __syncthreads();
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::move_spheres() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::move_spheres() {
   if constexpr (!HasContacts) return;
   __syncthreads();
   for (int b = threadIdx.x; b < contacts_.sphere_count; b += blockDim.x)
@@ -84,8 +90,10 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::move_
 }
 
 // Computes a and 1 / D of every vertex, w V of every element, and the smallest a / D.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::assemble_diagonal() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::assemble_diagonal() {
   const T* stiffness = call_.material.stiffness.of(in_.environment);
   constexpr bool own = Clustered && OnePerThread;
   T plain = T(0);
@@ -113,17 +121,19 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::assem
   __syncthreads();
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::compute_weights(
-    const T* stiffness, bool bounded) {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
+                           HasStencils>::compute_weights(const T* stiffness, bool bounded) {
   compute_patch_weights(patch_, rest_of<false>(patch_), stiffness, bounded, weights());
   __syncthreads();  // one lane has written the weights of two
   if constexpr (Many) load_own();
 }
 
 // Loads this thread's first tetrahedron or pair.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_own() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::load_own() {
   if constexpr (!TetPerLane) {
     pair_ = prefetch_pair(patch_, weights(), threadIdx.x);
     return;
@@ -141,9 +151,10 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_
 
 // The same without global memory, for one tetrahedron per thread; returns its weight without the
 // bound l_e.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE T FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::compute_own_weight(
-    const T* stiffness, bool bounded) {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE T FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
+                        HasStencils>::compute_own_weight(const T* stiffness, bool bounded) {
   const PairPlace place = place_of(patch_, min(int(threadIdx.x) / 2, patch_.pairs - 1));
   const int which = int(threadIdx.x) % 2, tet = tet_of(plan_, place, which);
   const auto rest = rest_of<false>(patch_).read(place);

@@ -5,37 +5,44 @@
 namespace pd::inline PD_TARGET {
 
 // Items are numbered with shared slots first.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::slot_of_item(
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::slot_of_item(
     int item) const {
   const int shared = patch_.shared();
   return item < shared ? patch_.interior + item : item - shared;
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::row_of_item(
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::row_of_item(
     int item) const {
   return item == int(threadIdx.x) ? row_ : patch_.row(slot_of_item(item));
 }
 
 // Rounds that this warp needs for `items` items.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::rounds(int items) const {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::rounds(
+    int items) const {
   const int threads = blockDim.x;
   return max(0, (items - (int(threadIdx.x) - lane()) + threads - 1) / threads);
 }
 
 // Rounds without shared slots come first, while messages are in flight.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::item_of_visit(
-    int visit) const {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE int FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
+                          HasStencils>::item_of_visit(int visit) const {
   const int waiting = rounds(patch_.shared()), all = rounds(patch_.slots);
   const int round = visit + waiting < all ? visit + waiting : visit + waiting - all;
   return int(threadIdx.x) + round * int(blockDim.x);
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_item(int item) {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::load_item(
+    int item) {
   if (item >= patch_.slots) return;
   const int slot = slot_of_item(item);
   loaded_ = v_.load(slot);
@@ -43,24 +50,28 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::load_
 }
 
 // Grid: sends the force on a shared vertex to the other patches.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::send_force(
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::send_force(
     int item, const Vec3<T>& force) const {
   const std::int64_t slot = patch_.first_slot + slot_of_item(item);
   HaloMessage::send(mailbox() + slot * HaloMessage::words, force, round_);
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::send_shared_forces() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::send_shared_forces() {
   ++round_;
   for (int item = threadIdx.x; item < patch_.shared(); item += blockDim.x)
     send_force(item, sum_entries_by_8<T>(entries_, row_of_item(item)));
   __syncwarp();
 }
 
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::receive_force(
-    int item) const {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
+                              HasStencils>::receive_force(int item) const {
   const auto* senders = reinterpret_cast<const Senders*>(plan_.slot_sender);
   return receive_forces<T>(mailbox(), senders, earlier_shared() + item, item < patch_.shared(),
                            round_);
@@ -68,25 +79,29 @@ PD_DEVICE Vec3<T> FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::re
 
 // Grid without InShared: loads the first item before the barrier; each later item is loaded during
 // the visit before it.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::prefetch_first() {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::prefetch_first() {
   load_item(item_of_visit(0));
 }
 
 // Contributes the energy of the current iterate, which the schedule's guard needs before the
 // update.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::store_energy(
-    bool owned) {
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
+PD_DEVICE void
+FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::store_energy(bool owned) {
   if (owned) energy_ += loaded_.energy();
   sums_.store_partial_early({energy_, 0, 0}, 1, Add{});
 }
 
 // Visits the interior rounds of a warp, then the shared ones, whose messages have arrived
 // meanwhile.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
 template <bool MayStop, class Visit>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::visit_items(
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::visit_items(
     const Visit& visit) {
   if (outer_pairs_ == patch_.pairs) send_shared_forces();
   read_control_late<MayStop>();
@@ -111,10 +126,11 @@ PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::visit
 
 // The same with one item per thread. A warp waits as one, since its lanes would otherwise continue
 // one after another.
-template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared>
+template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
+          bool HasStencils>
 template <bool MayStop, class Visit>
-PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared>::visit_one_item(
-    bool early, const Visit& visit) {
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
+                           HasStencils>::visit_one_item(bool early, const Visit& visit) {
   ++round_;
   const int item = threadIdx.x, shared = patch_.shared();
   // whether the warp has any slots, and any shared slots

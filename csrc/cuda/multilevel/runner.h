@@ -51,7 +51,8 @@ class MultilevelRunner {
     for (int patch = team_.rank(); patch < w_.plan.patches; patch += team_.blocks()) {
       ThreadSums sums = {{0, 0, 0}};
       sums.value[0] += pass_over_patch(
-          w_, patch, shared_, SolidGradient<true>{}, [&](int i) { return w_.v.load(i); },
+          w_, patch, shared_, SolidGradient<true>{}, NoStencilsOfPass{},
+          [&](int i) { return w_.v.load(i); },
           [&](int i, const auto& loaded, const Vec3<T>& force) {
             evaluate_vertex(i, loaded, force, sums);
           });

@@ -3,6 +3,7 @@
 #pragma once
 #include "cuda/common/reductions.h"
 #include "cuda/common/vertices.h"
+#include "cuda/elements/stencils.h"
 #include "cuda/elements/tet_per_lane.h"
 #include "cuda/rigid/rounds.h"
 #include "cuda/stream/kernel_overlap.h"
@@ -202,14 +203,28 @@ PD_DEVICE bool skips(const StreamWork<T, HasContacts>& w) {
   return updates && w.settings().tolerance > 0 && w.progress.done;
 }
 
+// The elements of a pass besides tetrahedra.
+struct NoStencilsOfPass {
+  static constexpr bool any = false;
+};
+template <class T>
+struct StencilsOfPass {
+  static constexpr bool any = true;
+  const StencilWork<T>& work;
+  bool bounded;  // whether the weights of a diagonal have l_e
+};
+
 // Computes the elements of a patch. Calls here(vertex, load(vertex), force) for every interior
 // vertex and stores the forces on shared vertices. Returns this thread's energy sum. `shared`:
-// pass_shared_bytes.
-template <class T, bool HasContacts, class Element, class Load, class Here>
+// pass_shared_bytes. `stencils`: StencilsOfPass, or NoStencilsOfPass.
+template <class T, bool HasContacts, class Element, class Stencils, class Load, class Here>
 PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number, std::byte* shared,
-                                 const Element& element, const Load& load, const Here& here) {
+                                 const Element& element, const Stencils& stencils, const Load& load,
+                                 const Here& here) {
   const Patch<T> patch(w.plan, number);
-  const TetInputs<T> first = load_tet<true>(patch, w.weights, int(threadIdx.x));
+  const bool has_tets = !Stencils::any || patch.pairs > 0;
+  TetInputs<T> first{};
+  if (has_tets) first = load_tet<true>(patch, w.weights, int(threadIdx.x));
   const Slots<T> slots(shared, w.plan.most_slots);
   const ComputedRest<T> rest = rest_of<true>(patch);
   const T per_unit = T(1) / rest.unit;
@@ -222,8 +237,19 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   const auto shape_of = [&](int, const TetInputs<T>& numbers, const Quad<T>(&loaded)[4]) {
     return tet_rest(numbers, per_unit, slots, loaded);
   };
-  const double energy = double(each_tet<false, true>(
-      patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, first));
+  T sum = T(0);
+  if (has_tets)
+    sum = each_tet<false, true>(
+        patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, first);
+  if constexpr (Stencils::any) {
+    const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
+      x[0] = vec3(slots.load(corner & 0xffff));
+    };
+    const int before = (2 * patch.pairs + warp_size - 1) / warp_size;
+    sum += each_stencil<1>(stencils.work, w.environment, number, before, read, entries,
+                           on_stencils(element, stencils.bounded));
+  }
+  const double energy = double(sum);
   // loads overlap with the barrier
   int s = threadIdx.x, row = 0;
   decltype(load(0)) loaded{};
@@ -248,14 +274,14 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   return energy;
 }
 
-// Updates the elements and interior vertices of every patch.
-template <Visit What, class T, bool HasContacts>
-__global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
-    stream_patches(const __grid_constant__ StreamCall<T> call, int k) {
-  extern __shared__ __align__(16) std::byte shared[];
+// Updates the elements and interior vertices of one patch per block.
+template <Visit What, class T, bool HasContacts, class Stencils>
+PD_DEVICE void update_patch(const StreamCall<T>& call, int k, std::byte* shared,
+                            const Stencils& stencils) {
   const int number = int(blockIdx.x % call.step.plan.patches);
   const StreamWork<T, HasContacts> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
+  if constexpr (Stencils::any) prefetch_stencils(stencils.work, w.environment, number);
   // prefetches data that is read after the elements
   const Patch<T> patch(w.plan, number);
   if constexpr (What != Visit::diagonal) {
@@ -266,13 +292,20 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
   ThreadSums sums = no_sums<What>();
   const double omega = omega_of_pass<What>(w, k);
   const double energy = pass_over_patch(
-      w, number, shared, typename ElementOf<What>::type{},
+      w, number, shared, typename ElementOf<What>::type{}, stencils,
       [&](int i) { return load_vertex<What>(w, i); },
       [&](int i, const auto& loaded, const Vec3<T>& force) {
         visit<What>(w, i, loaded, force, T(omega), sums);
       });
   if constexpr (What != Visit::diagonal) sums.value[0] += energy;
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));
+}
+
+template <Visit What, class T, bool HasContacts>
+__global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
+    stream_patches(const __grid_constant__ StreamCall<T> call, int k) {
+  extern __shared__ __align__(16) std::byte shared[];
+  update_patch<What, T, HasContacts>(call, k, shared, NoStencilsOfPass{});
 }
 
 // Decisions from the sums of a pass, one environment per block.

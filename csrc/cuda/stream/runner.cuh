@@ -5,6 +5,7 @@
 #include "cuda/common/launch.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/teams.cuh"
+#include "cuda/stream/mixed_interface.h"
 #include "cuda/stream/multilevel_interface.h"
 #include "cuda/stream/pipeline.h"
 #include "cuda/stream/pipeline_elements.h"
@@ -88,12 +89,14 @@ class Launcher {
 template <class T, bool HasContacts>
 class StreamRunner {
  public:
-  // `outer`: memory of outer_bytes, for the multilevel solver only
-  StreamRunner(const StreamCall<T>& call, void* multilevel_memory, cudaStream_t stream)
+  // `multilevel_memory`: of multilevel_bytes, for the multilevel solver only. `stencils`: null without any
+  StreamRunner(const StreamCall<T>& call, void* multilevel_memory, const StencilWork<T>* stencils,
+               cudaStream_t stream)
       : call_(call),
         set_(call_.step.settings),
         plan_(call_.step.plan),
         multilevel_(multilevel_memory),
+        stencils_(stencils),
         stream_(stream),
         launcher_(stream),
         teams_(call.step.batch, resident_blocks(rounds_kernel(), rounds_threads, 0),
@@ -161,12 +164,17 @@ class StreamRunner {
   void assemble_diagonal() {
     const bool own = call_.step.material.stiffness.stride != 0;
     const std::int64_t sets = own ? patches_ : plan_.patches;
-    launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, set_.weighted);
+    weights(sets, set_.weighted);
     // the pass starts from u = 0 at the current positions
     launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
     pass<Visit::diagonal>(0);
     decide<Decision::diagonal>(0);
-    if (set_.weighted) launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, false);
+    if (set_.weighted) weights(sets, false);
+  }
+
+  void weights(std::int64_t sets, bool bounded) {
+    if (stencils_) return run_mixed_weights(call_, sets, bounded, stream_);
+    launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, bounded);
   }
 
   void store(int record) {
@@ -180,10 +188,14 @@ class StreamRunner {
     // place, so no old message matches. With a tolerance the number is 0 too, and stream_shared
     // waits for the whole pass, since converged environments send nothing.
     const unsigned round = set_.tolerance > 0 ? 0 : ++round_;
-    const bool piped = pipe<What>(k, round);
-    if (!piped)
+    const bool piped = !stencils_ && pipe<What>(k, round);
+    if (stencils_) {
+      const MixedStreamCall<T> call{call_, *stencils_};
+      run_mixed_pass<T, HasContacts>(What, call, patches_, pass_shared_, k, stream_);
+    } else if (!piped) {
       launcher_.run(stream_patches<What, T, HasContacts>, patches_, pass_threads, pass_shared_,
                     call_, k);
+    }
     launcher_.run_overlapped(stream_shared<What, T, HasContacts>,
                              call_.step.batch * call_.shared_blocks(), shared_threads, 0, call_, k,
                              piped ? round : 0u);
@@ -244,6 +256,7 @@ class StreamRunner {
   const Settings& set_;
   const DevicePlan<T>& plan_;
   void* multilevel_;
+  const StencilWork<T>* stencils_;
   cudaStream_t stream_;
   Launcher launcher_;
   Teams teams_;           // for rigid motions
@@ -272,10 +285,22 @@ void allow_shared_memory(std::size_t bytes) {
 }
 
 template <class T, bool HasContacts>
-void run_stream_with(const StreamCall<T>& call, void* multilevel_memory, cudaStream_t stream) {
-  allow_shared_memory<T, HasContacts>(
-      pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2));
-  StreamRunner<T, HasContacts>(call, multilevel_memory, stream).rollout();
+void run_stream_with(const StreamCall<T>& call, void* multilevel_memory,
+                     const StencilWork<T>* stencils, cudaStream_t stream) {
+  const std::size_t bytes =
+      pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2);
+  stencils ? allow_mixed_passes<T, HasContacts>(bytes) : allow_shared_memory<T, HasContacts>(bytes);
+  StreamRunner<T, HasContacts>(call, multilevel_memory, stencils, stream).rollout();
+}
+
+template <class T>
+void run_stream_with(const StreamCall<T>& call, void* multilevel_memory,
+                     const StencilWork<T>* stencils, cudaStream_t stream) {
+  if (has_contacts(call.step)) {
+    run_stream_with<T, true>(call, multilevel_memory, stencils, stream);
+  } else {
+    run_stream_with<T, false>(call, multilevel_memory, stencils, stream);
+  }
 }
 
 template <class T>
@@ -285,11 +310,31 @@ void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
   Arena arena(memory);
   call.memory = arrange(arena, call);
   void* multilevel_memory = static_cast<std::byte*>(memory) + arena.size();
-  if (has_contacts(step)) {
-    run_stream_with<T, true>(call, multilevel_memory, stream);
-  } else {
-    run_stream_with<T, false>(call, multilevel_memory, stream);
-  }
+  run_stream_with<T>(call, multilevel_memory, nullptr, stream);
+}
+
+template <class T>
+StencilWork<T> arrange_mixed(Arena& arena, const MixedStep<T>& step, StreamCall<T>& call) {
+  call.memory = arrange(arena, call);
+  return arrange_stencils(arena, step.stencils, step.effects, step.batch);
+}
+
+template <class T>
+std::int64_t mixed_stream_bytes(const MixedStep<T>& step) {
+  Arena arena(nullptr);
+  StreamCall<T> call{step, {}};
+  arrange_mixed(arena, step, call);
+  return arena.size();
+}
+
+template <class T>
+void run_mixed_stream(const MixedStep<T>& step, void* memory, Stream to) {
+  const auto stream = static_cast<cudaStream_t>(to);
+  StreamCall<T> call{step, {}};
+  Arena arena(memory);
+  const StencilWork<T> stencils = arrange_mixed(arena, step, call);
+  compute_stencil_numbers(stencils, step.effects, step.batch, stream);
+  run_stream_with<T>(call, nullptr, &stencils, stream);
 }
 
 }  // namespace pd

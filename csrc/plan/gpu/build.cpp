@@ -3,6 +3,7 @@
 #include "plan/gpu/bank_conflicts.h"
 #include "plan/gpu/ownership.h"
 #include "plan/gpu/patch.h"
+#include "plan/gpu/stencil_blocks.h"
 #include "plan/mesh/rest_shape.h"
 #include "threads/team.h"
 #include "views/shared_memory.h"
@@ -62,14 +63,15 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, c
   for (int c = 0; c < 5; ++c) vertex[c] = patch.vertex[pair.corner[c]];
   double volume[2];
   for (int which = 0; which < 2; ++which) {
-    const Rest rest = rest_of(mesh.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
+    const Rest rest =
+        rest_of(mesh.elements.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
     plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
     if (!plan.pair_factor.empty())
       plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
     volume[which] = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
   }
   if (plan.pair_rest.empty()) return;
-  const std::array<double, 9> face = face_rest(mesh.positions, vertex);
+  const std::array<double, 9> face = face_rest(mesh.elements.positions, vertex);
   const double fourth[3] = {0, volume[0], volume[1]};
   for (int quad = 0; quad < 3; ++quad) {
     double* to = &plan.pair_rest[((block * 3 + quad) * lanes + lane) * 4];
@@ -79,9 +81,8 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, c
 }
 
 void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, int number,
-                 double unit) {
+                 double unit, EntryChoice& choice) {
   const std::int64_t first_block = plan.patch_block[number];
-  EntryChoice choice(patch.first, patch.forces, patch.piped);
   const std::int64_t count = std::ssize(patch.pairs);
   for (std::int64_t i = 0; i < patch.blocks() * lanes; ++i) {
     const std::int64_t block = first_block + i / lanes, lane = i % lanes;
@@ -129,8 +130,8 @@ void fill_slots(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, 
 void fill_rest_positions(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch,
                          int number) {
   const auto offset = [&](std::size_t s, int c) {
-    return mesh.positions[3 * std::int64_t(patch.vertex[s]) + c] -
-           mesh.positions[3 * std::int64_t(patch.vertex[0]) + c];
+    return mesh.elements.positions[3 * std::int64_t(patch.vertex[s]) + c] -
+           mesh.elements.positions[3 * std::int64_t(patch.vertex[0]) + c];
   };
   const std::size_t count = patch.vertex.size(), first = 4 * std::size_t(plan.patch_slot[number]);
   if (!plan.slot_rest.empty()) {
@@ -268,18 +269,18 @@ std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan,
 
 }  // namespace
 
-DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
-                                 const std::int64_t* tets, std::int64_t count, int patches,
-                                 int kernel, bool fixed, const std::int32_t* piece,
+DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int kernel, bool fixed,
+                                 const std::int32_t* piece,
                                  const std::function<void(double)>& progress) {
-  Mesh mesh{positions, tets, {}, {}, {}, kernel};
+  const std::int64_t vertices = elements.vertices;
+  Mesh mesh{elements, {}, {}, {}, kernel};
   if (kernel == cluster_kernel) {
-    Ownership owned = own_vertices(positions, vertices, tets, count, patches);
+    Ownership owned =
+        own_vertices(elements.positions, vertices, elements.tets, elements.tet_count, patches);
     mesh.partition = std::move(owned.mesh);
     mesh.owner = std::move(owned.owner);
     mesh.numbering = number_owned(mesh.owner, patches);
   } else {
-    const MeshElements elements{positions, vertices, tets, count};
     mesh.partition = partition_mesh(elements, patches, 1);
     mesh.numbering = number_vertices(mesh.partition, elements);
   }
@@ -289,6 +290,7 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
 
   DeviceMeshPlan plan;
   number_patches(plan, made, kernel != stream_kernel, fixed);
+  number_stencils(plan, elements, made);
   renumber(mesh.numbering, made);
   plan.vertex_order = mesh.numbering.vertex_order;
   run_team(most_threads(), [&](const Team& team) {
@@ -296,7 +298,9 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
       fill_slots(plan, mesh, made[p], int(p));
       const bool computed = kernel == stream_kernel;
       if (computed) fill_rest_positions(plan, mesh, made[p], int(p));
-      fill_blocks(plan, mesh, made[p], int(p), computed ? plan.patch_unit[p] : 1.0);
+      EntryChoice choice(made[p].first, made[p].forces, made[p].piped);
+      fill_blocks(plan, mesh, made[p], int(p), computed ? plan.patch_unit[p] : 1.0, choice);
+      fill_stencils(plan, elements, made[p], int(p), choice);
     }
   });
   plan.patch_vertex = std::move(mesh.numbering.patch_vertex);
@@ -312,7 +316,7 @@ DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
   // small parts keep all warps busy where few blocks hold an environment
   const bool few = kernel == block_kernel || kernel == cluster_kernel;
   if (pieces > 0) add_parts(plan, piece, pieces, few ? small_part : int(vertices));
-  plan.sizes = count_sizes(plan, made, count, pieces, kernel);
+  plan.sizes = count_sizes(plan, made, elements.tet_count, pieces, kernel);
   progress(1.0);
   return plan;
 }

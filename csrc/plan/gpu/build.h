@@ -1,7 +1,8 @@
-// Compiles a tetrahedral mesh into the arrays of views/gpu_plan.def: patches, pairs, gather lists and rest
-// shapes.
+// Compiles the elements of a scene into the arrays of views/gpu_plan.def and views/gpu_stencils.def: patches, pairs,
+// stencils, gather lists and rest shapes.
 #pragma once
 
+#include "plan/mesh/elements.h"
 #include "views/views.h"
 
 #include <cstdint>
@@ -10,25 +11,24 @@
 
 namespace pd {
 
-// The table as vectors. The caller adds pins: pin_vertex and vertex_pin are empty, and sizes counts
+// The tables as vectors. The caller adds pins: pin_vertex and vertex_pin are empty, and sizes counts
 // no pins.
 struct DeviceMeshPlan {
   using real = double;
 #define X(name, type, width, rows, meaning) std::vector<type> name;
 #include "views/gpu_plan.def"
+#include "views/gpu_stencils.def"
 #undef X
 };
 
-// Builds the plan. `positions` [vertices, 3]: rest positions. `tets` [count, 4]: tetrahedra of
-// positive volume. `piece` [vertices]: the connected piece without pins of each vertex, or -1.
-// `kernel`: as in DeviceKernel. `fixed`: for float32. `progress` is called with the fraction done.
+// Builds the plan. `piece` [vertices]: the connected piece without pins of each vertex, or -1. `kernel`: as in
+// DeviceKernel. `fixed`: for float32. `progress` is called with the fraction done.
 //
-// The caller checks all inputs and 1 <= patches <= count; for a cluster, also patches <= vertices
-// and patches <= most_cluster_blocks. Throws std::invalid_argument when a patch exceeds a 16-bit
-// count, and std::overflow_error when the plan exceeds a 32-bit count.
-DeviceMeshPlan build_device_plan(const double* positions, std::int64_t vertices,
-                                 const std::int64_t* tets, std::int64_t count, int patches,
-                                 int kernel, bool fixed, const std::int32_t* piece,
+// The caller checks all inputs and 1 <= patches <= elements; for a cluster, also patches <= vertices
+// and patches <= most_cluster_blocks. Only the kernels block and stream take stencils. Throws std::invalid_argument
+// when a patch exceeds a 16-bit count, and std::overflow_error when the plan exceeds a 32-bit count.
+DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int kernel, bool fixed,
+                                 const std::int32_t* piece,
                                  const std::function<void(double)>& progress);
 
 }  // namespace pd

@@ -16,7 +16,7 @@ namespace pd {
 namespace {
 
 constexpr int slice = entry_slice;
-constexpr int small_pairs = 512;  // of a patch
+constexpr int small_pairs = 512;  // of a patch, and stencils
 
 [[noreturn]] void refuse(int patches, std::int64_t count, const char* what, std::int64_t most) {
   throw std::invalid_argument("patches = " + std::to_string(patches) +
@@ -32,7 +32,7 @@ constexpr int small_pairs = 512;  // of a patch
 std::vector<std::int32_t> slots_of(const MeshPatch& patch, int number, const Numbering& numbering) {
   std::vector<std::int32_t> order(patch.vertex.size()), slot(order.size());
   for (std::size_t v = 0; v < order.size(); ++v) order[v] = std::int32_t(v);
-  const bool small = std::ssize(patch.pairs) <= small_pairs;
+  const bool small = patch.elements() <= small_pairs;
   std::stable_sort(order.begin(), order.end(), [&](std::int32_t a, std::int32_t b) {
     const std::int32_t one = patch.vertex[a], two = patch.vertex[b];
     const bool shared = !numbering.is_inside(number, one);
@@ -85,27 +85,51 @@ void order_pairs(MeshPatch& patch, int number, const Numbering& numbering) {
   patch.pairs.insert(patch.pairs.end(), rest.begin(), rest.end());
 }
 
+// The stencils of a patch kind by kind; `elements` of the patch ascend from its first stencil on.
+template <class Number>
+void add_stencils(MeshPatch& patch, const MeshElements& all, std::span<const std::int32_t> elements,
+                  const Number& local) {
+  std::int64_t first = all.tet_count;
+  auto next = elements.begin();
+  for (std::size_t g = 0; g < all.groups.size(); first += all.groups[g++].count) {
+    PatchStencils own;
+    own.group = int(g);
+    for (; next != elements.end() && *next < first + all.groups[g].count; ++next) {
+      own.number.push_back(std::int32_t(*next - first));
+      for (const std::int64_t v : all.corners(*next)) own.corner.push_back(local(v));
+    }
+    if (!own.number.empty()) patch.stencils.push_back(std::move(own));
+  }
+}
+
 // `number` [vertices] is -1 before and after the call.
 MeshPatch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& number) {
-  const std::span<const std::int32_t> tets = mesh.partition.patch(index);
+  const std::span<const std::int32_t> elements = mesh.partition.patch(index);
+  const auto end = std::lower_bound(elements.begin(), elements.end(), mesh.elements.tet_count);
+  const auto tets = elements.first(std::size_t(end - elements.begin()));
   MeshPatch patch;
+  const auto local = [&](std::int64_t v) {
+    if (number[v] < 0) {
+      number[v] = std::int32_t(patch.vertex.size());
+      patch.vertex.push_back(std::int32_t(v));
+    }
+    return number[v];
+  };
   std::vector<Corners> corners(tets.size());
   for (std::size_t t = 0; t < tets.size(); ++t) {
-    for (int k = 0; k < 4; ++k) {
-      const std::int64_t v = mesh.tets[4 * std::int64_t(tets[t]) + k];
-      if (number[v] < 0) {
-        number[v] = std::int32_t(patch.vertex.size());
-        patch.vertex.push_back(std::int32_t(v));
-      }
-      corners[t][k] = number[v];
-    }
+    for (int k = 0; k < 4; ++k)
+      corners[t][k] = local(mesh.elements.tets[4 * std::int64_t(tets[t]) + k]);
   }
+  add_stencils(patch, mesh.elements, elements.subspan(tets.size()), local);
   for (const std::int32_t v : patch.vertex) number[v] = -1;
 
   patch.pairs = pair_tets(corners);
   patch.forces.assign(patch.vertex.size(), 0);
   for (const Pair& pair : patch.pairs) {
     for (int c = 0; c < pair.corners(); ++c) ++patch.forces[pair.corner[c]];
+  }
+  for (const PatchStencils& own : patch.stencils) {
+    for (const std::int32_t corner : own.corner) ++patch.forces[corner];
   }
   const std::vector<std::int32_t> slot = slots_of(patch, index, mesh.numbering);
   scatter(patch.vertex, slot);
@@ -114,8 +138,12 @@ MeshPatch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& num
     for (std::int32_t& corner : pair.corner) corner = slot[corner];
     for (std::int32_t& tet : pair.tet) tet = tet < 0 ? -1 : tets[tet];
   }
+  for (PatchStencils& own : patch.stencils) {
+    for (std::int32_t& corner : own.corner) corner = slot[corner];
+  }
   order_pairs(patch, index, mesh.numbering);
-  patch.piped = mesh.kernel == stream_kernel && std::ssize(patch.vertex) <= pipeline_slots;
+  patch.piped = mesh.kernel == stream_kernel && mesh.elements.groups.empty() &&
+                std::ssize(patch.vertex) <= pipeline_slots;
   count_entries(patch);
   return patch;
 }
@@ -124,12 +152,12 @@ MeshPatch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& num
 
 std::vector<MeshPatch> make_patches(const Mesh& mesh, std::int64_t vertices) {
   const Partition& partition = mesh.partition;
-  std::int64_t most_tets = 0;
+  std::int64_t most_elements = 0;
   for (int p = 0; p < partition.patches(); ++p)
-    most_tets = std::max(most_tets, std::ssize(partition.patch(p)));
-  // two tetrahedra have at least five entries
-  if (5 * most_tets / 2 >= none)
-    refuse(partition.patches(), 5 * most_tets / 2, "entries", none - 1);
+    most_elements = std::max(most_elements, std::ssize(partition.patch(p)));
+  // two tetrahedra have at least five entries, and two stencils four
+  const std::int64_t least = (mesh.elements.groups.empty() ? 5 : 4) * most_elements / 2;
+  if (least >= none) refuse(partition.patches(), least, "entries", none - 1);
   std::vector<MeshPatch> patches(partition.patches());
   run_team(most_threads(), [&](const Team& team) {
     std::vector<std::int32_t> number(vertices, -1);

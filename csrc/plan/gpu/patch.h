@@ -18,8 +18,7 @@ constexpr std::int64_t slot_step = 8, most_slots = 8192;  // in pair_corner
 constexpr int block_kernel = 0, cluster_kernel = 1, grid_kernel = 2, stream_kernel = 3;
 
 struct Mesh {
-  const double* positions;
-  const std::int64_t* tets;
+  const MeshElements& elements;
   Partition partition;
   Numbering numbering;
   std::vector<std::int32_t> owner;  // cluster: the patch that owns each vertex
@@ -27,9 +26,18 @@ struct Mesh {
 
   // The patch that counts the energy of a tetrahedron, if several compute it.
   std::int32_t counted_by(std::int32_t tet) const {
-    const std::int64_t* v = tets + 4 * std::int64_t(tet);
+    const std::int64_t* v = elements.tets + 4 * std::int64_t(tet);
     return std::min({owner[v[0]], owner[v[1]], owner[v[2]], owner[v[3]]});
   }
+};
+
+// Stencils of one kind in a patch.
+struct PatchStencils {
+  int group = 0;                     // of MeshElements
+  std::vector<std::int32_t> number;  // in the group
+  std::vector<std::int32_t> corner;  // slots
+
+  std::int64_t blocks() const { return (std::ssize(number) + lanes - 1) / lanes; }
 };
 
 // A patch in local numbers.
@@ -38,11 +46,17 @@ struct MeshPatch {
   std::vector<std::int32_t> first;   // first entry of each slot
   std::vector<std::int32_t> forces;  // entries that each slot sums
   std::vector<Pair> pairs;           // user's tetrahedra; corners are slots
-  std::int64_t outer = 0;            // number of leading pairs that may touch shared vertices
+  std::vector<PatchStencils> stencils;
+  std::int64_t outer = 0;  // number of leading pairs that may touch shared vertices
   std::int64_t entries = 0;
   bool piped = false;  // whether cuda/stream/pipeline.h reads and writes the entries
 
   std::int64_t blocks() const { return (std::ssize(pairs) + lanes - 1) / lanes; }
+  std::int64_t elements() const {
+    std::int64_t count = std::ssize(pairs);
+    for (const PatchStencils& own : stencils) count += std::ssize(own.number);
+    return count;
+  }
 };
 
 // Throws std::invalid_argument when a patch exceeds a 16-bit count.

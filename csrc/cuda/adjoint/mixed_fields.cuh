@@ -1,0 +1,218 @@
+// Fields of energy_fields.cuh for scenes with stencils, and what belongs to the stencils alone.
+#pragma once
+#include "cuda/adjoint/sums.cuh"
+#include "cuda/common/stencil_numbers.h"
+
+namespace pd {
+
+template <class T>
+struct MixedFieldWork : FieldWork<T> {
+  StencilWork<T> stencils;
+  EffectViews<T> effects;
+  double* energies;                    // [batch, patches] of the stencils
+  int counts[int(KindNumber::count)];  // stencils of each kind
+};
+
+template <bool Computed, class Element, int Fields, int Numbers, class T>
+__global__ void __launch_bounds__(field_threads)
+    mixed_vertices(const __grid_constant__ MixedFieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const PatchFields<Fields, T> fields(work.field, shared);
+  const Patch<T>& patch = fields.patch;
+  each_pair_and_stencil<Fields>(patch, fields, rest_of<Computed>(patch),
+                                work.weights_of(fields.environment), work.stencils,
+                                fields.environment, work.field.weighted, fields.entries, Element{});
+  __syncthreads();
+  write_patch<Numbers>(work, fields);
+}
+
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    stencil_energies(const __grid_constant__ MixedFieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  __shared__ WarpSums warp_sums;
+  const PatchFields<1, T> fields(work.field, shared);
+  double sum[1] = {double(each_stencil<1>(work.stencils, fields.environment, fields.patch.index, 0,
+                                          fields, fields.entries, StencilGradient<true>{}))};
+  block_reduce<Add>(sum, warp_sums);
+  if (threadIdx.x == 0)
+    work.energies[fields.environment * work.field.plan.patches + fields.patch.index] = sum[0];
+}
+
+// One block per environment.
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    sum_energies(const __grid_constant__ MixedFieldWork<T> work) {
+  __shared__ WarpSums warp_sums;
+  double sum[1];
+  const int patches = work.field.plan.patches;
+  const PartialSums<Add, 1> parts{work.energies + blockIdx.x * std::int64_t(patches), patches};
+  parts.reduce(sum, warp_sums);
+  if (threadIdx.x == 0) work.field.out[blockIdx.x] = T(sum[0]);
+}
+
+// Derivatives of a stencil by the rows of its material. `Product`: of the product with the direction, else the energy.
+template <class Kind, bool Product, int Fields, class T>
+__device__ void write_products(const MixedFieldWork<T>& work, const PatchFields<Fields, T>& fields,
+                               const StencilPlace<T>& place) {
+  constexpr EffectsOf<Kind> effects;
+  const DeviceStencils<T>& plan = work.stencils.plan;
+  const T measure = plan.stencil_measure[place.stencil()];
+  if (measure == T(0)) return;  // padding
+  const int number = plan.stencil_order[place.stencil()];
+  const MaterialRows<Kind, T> rows(work.effects.effects, fields.environment);
+  T g[gradient_numbers<Kind>], c[constant_slots<Kind>] = {}, row[Kind::rows];
+  for (int i = 0; i < gradient_numbers<Kind>; ++i) g[i] = place.stored(i);
+  for (int i = 0; i < Kind::constants; ++i) c[i] = place.stored(gradient_numbers<Kind> + i);
+  for (int i = 0; i < Kind::rows; ++i) row[i] = rows.row[i][number];
+  Vec3<T> vectors[Kind::corners][Fields], x[Kind::corners], f[Kind::dims], df[Kind::dims] = {};
+  for (int a = 0; a < Kind::corners; ++a) fields(place.corner(a), vectors[a]);
+  for (int a = 0; a < Kind::corners; ++a) x[a] = vectors[a][0];
+  deform<Kind>(x, g, f);
+  if constexpr (Product) {
+    for (int a = 0; a < Kind::corners; ++a) x[a] = vectors[a][1];
+    deform<Kind>(x, g, df);
+  }
+  for (int i = 0; i < Kind::rows; ++i) {
+    T* const out = work.effects.products[effects.effect[i]];
+    if (!out) continue;
+    const RowDerivative<Kind, T> by(i, row, measure, f, df, c);
+    out[fields.environment * work.counts[kind_number<Kind>] + number] =
+        Product ? by.product : by.energy;
+  }
+}
+
+template <bool Product, class T>
+__global__ void __launch_bounds__(field_threads)
+    stencil_products(const __grid_constant__ MixedFieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  constexpr int wanted = Product ? 2 : 1;
+  const PatchFields<wanted, T> fields(work.field, shared);
+  each_stencil_block(work.stencils.plan, fields.patch.index, 0,
+                     [&](auto kind, const StencilPlace<T>& place) {
+                       write_products<decltype(kind), Product>(work, fields, place);
+                     });
+}
+
+// The stiffness at rest of tetrahedra, then of stencils kind by kind, per measure.
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    element_stiffness(const __grid_constant__ MixedFieldWork<T> work, std::int64_t elements) {
+  const DeviceStencils<T>& plan = work.stencils.plan;
+  const std::int64_t tets = work.field.plan.tets;
+  const std::int64_t blocks = (tets + stencil_lanes - 1) / stencil_lanes + plan.blocks;
+  const std::int64_t thread = std::int64_t(blockIdx.x) * field_threads + threadIdx.x;
+  const std::int64_t environment = thread / stencil_lanes / blocks;
+  if (environment >= work.field.batch) return;
+  T* const out = work.field.out + environment * elements;
+  const std::int64_t block = thread / stencil_lanes % blocks;
+  if (block >= plan.blocks) {
+    const std::int64_t t = (block - plan.blocks) * stencil_lanes + thread % stencil_lanes;
+    if (t < tets) out[t] = work.field.stiffness.of(environment)[t];
+    return;
+  }
+  const StencilPlace<T> place(plan, int(block));
+  if (plan.stencil_measure[place.stencil()] == T(0)) return;  // padding
+  std::int64_t first = tets;
+  for (int kind = 0; kind < place.block.kind; ++kind) first += work.counts[kind];
+  const int number = plan.stencil_order[place.stencil()];
+  with_kind(place.block.kind, [&](auto kind) {
+    using Kind = decltype(kind);
+    T numbers[Kind::numbers];
+    MaterialRows<Kind, T>(work.effects.effects, environment).read(number, T(1), numbers);
+    out[first + number] = Kind::weight(numbers, T(1), T(1));
+  });
+}
+
+// instantiated in fields_float.cu and fields_double.cu
+extern template void run_field(const DeviceField<float>&, void*, Stream);
+extern template void run_field(const DeviceField<double>&, void*, Stream);
+
+template <class T>
+MixedFieldWork<T> arrange_mixed(Arena& arena, const MixedField<T>& field) {
+  const DeviceField<T>& call = field;
+  MixedFieldWork<T> work;
+  static_cast<FieldWork<T>&>(work) = arrange(arena, call, field.batch);
+  work.stencils = arrange_stencils(arena, field.stencils, field.effects, field.batch);
+  work.effects = field;
+  const bool sums = field.field == Field::effect_energy;
+  arena.place(work.energies, sums ? field.batch * field.plan.patches : 0);
+  for (int kind = 0; kind < int(KindNumber::count); ++kind)
+    work.counts[kind] = field.stencils.stencil_sizes[stencil_size_count + kind];
+  return work;
+}
+
+template <class T>
+std::int64_t mixed_field_bytes(const MixedField<T>& field) {
+  Arena arena(nullptr);
+  arrange_mixed(arena, field);
+  return arena.size();
+}
+
+template <bool Computed, class Element, int Fields, int Numbers, class T>
+void run_mixed_vertices(const MixedFieldWork<T>& work, cudaStream_t stream) {
+  launch_field(mixed_vertices<Computed, Element, Fields, Numbers, T>, work, Fields, stream);
+  run_shared<Numbers, T>(work, stream);
+}
+
+template <class T>
+void run_energies(const MixedFieldWork<T>& work, cudaStream_t stream) {
+  launch_field(stencil_energies<T>, work, 1, stream);
+  sum_energies<T><<<blocks_of(work.field.batch), field_threads, 0, stream>>>(work);
+  check(cudaGetLastError());
+}
+
+template <class T>
+void run_stiffness(const MixedFieldWork<T>& work, cudaStream_t stream) {
+  const std::int64_t tets = work.field.plan.tets;
+  std::int64_t elements = tets;
+  for (const int count : work.counts) elements += count;
+  const std::int64_t blocks =
+      work.stencils.plan.blocks + (tets + stencil_lanes - 1) / stencil_lanes;
+  const std::int64_t threads = work.field.batch * blocks * stencil_lanes;
+  element_stiffness<T>
+      <<<blocks_of((threads + field_threads - 1) / field_threads), field_threads, 0, stream>>>(
+          work, elements);
+  check(cudaGetLastError());
+}
+
+template <bool Computed, class T>
+void run_mixed_field_with(const MixedFieldWork<T>& work, cudaStream_t stream) {
+  compute_field_weights<Computed, T>(work, stream);
+  switch (work.field.field) {
+    case Field::gradient:
+      return run_mixed_vertices<Computed, SolidGradient<false>, 1, 3>(work, stream);
+    case Field::diagonal:
+      return run_mixed_vertices<Computed, SolidDiagonal, 1, 1>(work, stream);
+    case Field::report:
+      return run_mixed_vertices<Computed, SolidReport, 1, 3>(work, stream);
+    case Field::hessian_product:
+      return run_mixed_vertices<Computed, SolidHessian, 2, 3>(work, stream);
+    default:
+      return;
+  }
+}
+
+template <class T>
+void run_mixed_field(const MixedField<T>& field, void* memory, Stream to) {
+  // of tetrahedra alone
+  if (field.field == Field::element_energy || field.field == Field::element_energy_product)
+    return run_field<T>(field, memory, to);
+  const auto stream = static_cast<cudaStream_t>(to);
+  Arena arena(memory);
+  const MixedFieldWork<T> work = arrange_mixed(arena, field);
+  if (field.field == Field::stiffness_at_rest) return run_stiffness(work, stream);
+  compute_stencil_numbers(work.stencils, field.effects, field.batch, stream);
+  if (field.field == Field::effect_energy) return run_energies(work, stream);
+  if (field.field == Field::effect_products) {
+    if (field.direction) return launch_field(stencil_products<true, T>, work, 2, stream);
+    return launch_field(stencil_products<false, T>, work, 1, stream);
+  }
+  if (computes_rests(field.plan)) {
+    run_mixed_field_with<true>(work, stream);
+  } else {
+    run_mixed_field_with<false>(work, stream);
+  }
+}
+
+}  // namespace pd

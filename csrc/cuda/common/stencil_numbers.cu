@@ -1,0 +1,46 @@
+#include "cuda/common/stencil_numbers.h"
+
+#include "cuda/common/runtime.h"
+
+namespace pd {
+
+constexpr int number_threads = 256;
+
+// One warp per block of stencils and environment.
+template <class T>
+__global__ void __launch_bounds__(number_threads)
+    stencil_numbers(const __grid_constant__ StencilWork<T> work,
+                    const __grid_constant__ Effects<T> effects, std::int64_t sets) {
+  const std::int64_t warp =
+      (std::int64_t(blockIdx.x) * number_threads + threadIdx.x) / stencil_lanes;
+  if (warp >= sets * work.plan.blocks) return;
+  const std::int64_t environment = warp / work.plan.blocks;
+  const StencilPlace<T> place(work.plan, int(warp % work.plan.blocks));
+  T* const to = work.numbers_of(environment);
+  with_kind(place.block.kind, [&](auto kind) {
+    using Kind = decltype(kind);
+    T number[Kind::numbers];
+    const MaterialRows<Kind, T> rows(effects, environment);
+    rows.read(work.plan.stencil_order[place.stencil()], work.plan.stencil_measure[place.stencil()],
+              number);
+    for (int i = 0; i < Kind::numbers; ++i) to[place.number_of_step(i)] = number[i];
+  });
+}
+
+template <class T>
+void compute_stencil_numbers(const StencilWork<T>& work, const Effects<T>& effects,
+                             std::int64_t batch, cudaStream_t stream) {
+  const std::int64_t sets = work.stride ? batch : 1;
+  const std::int64_t threads = sets * work.plan.blocks * stencil_lanes;
+  stencil_numbers<T>
+      <<<blocks_of((threads + number_threads - 1) / number_threads), number_threads, 0, stream>>>(
+          work, effects, sets);
+  check(cudaGetLastError());
+}
+
+template void compute_stencil_numbers(const StencilWork<float>&, const Effects<float>&,
+                                      std::int64_t, cudaStream_t);
+template void compute_stencil_numbers(const StencilWork<double>&, const Effects<double>&,
+                                      std::int64_t, cudaStream_t);
+
+}  // namespace pd

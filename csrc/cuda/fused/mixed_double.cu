@@ -1,0 +1,6 @@
+#include "cuda/fused/mixed_launch.cuh"
+
+namespace pd {
+template std::int64_t mixed_block_bytes(const MixedStep<double>&);
+template void run_mixed_block(const MixedStep<double>&, void*, Stream);
+}  // namespace pd

@@ -1,0 +1,11 @@
+#include "cuda/stream/mixed_passes.cuh"
+
+namespace pd {
+template void allow_mixed_passes<double, true>(std::size_t);
+template void allow_mixed_passes<double, false>(std::size_t);
+template void run_mixed_pass<double, true>(Visit, const MixedStreamCall<double>&, std::int64_t,
+                                           std::size_t, int, cudaStream_t);
+template void run_mixed_pass<double, false>(Visit, const MixedStreamCall<double>&, std::int64_t,
+                                            std::size_t, int, cudaStream_t);
+template void run_mixed_weights(const StreamCall<double>&, std::int64_t, bool, cudaStream_t);
+}  // namespace pd

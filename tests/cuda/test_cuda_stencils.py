@@ -1,0 +1,312 @@
+"""Scenes with stencils in the kernels block and stream: iterates, gradients, bits, graphs and memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from devices import require_gpu
+from mixed_scenes import CASES, mixed_case, sheet_case
+from on_gpu import DTYPES, GPU, host_waits, moved, on_gpu, relative
+from runs import noise, same_bits, simulator, state_of
+from torch import Tensor
+
+import torchpd as pd
+from torchpd.common.tables import EFFECT_ROWS
+from torchpd.ops import INFO_WIDTH
+from torchpd.plan import kernel_choice as regimes
+from torchpd.plan.placement import step_bytes
+
+require_gpu()
+
+KERNELS = ("block", "stream")
+EFFECTS = {row.name for row in EFFECT_ROWS}
+ROUNDED = 1e-12  # of float64, relative to the largest number
+pytestmark = [
+    pytest.mark.usefixtures("poisoned"),
+    # they start a little inside a ground and a ball, so that contacts act
+    pytest.mark.filterwarnings("ignore::torchpd.SceneWarning"),
+    pytest.mark.parametrize("precision", DTYPES),
+]
+
+
+@pytest.fixture(autouse=True)
+def several_patches(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stream cuts these small scenes into patches too."""
+    for dtype in DTYPES.values():
+        monkeypatch.setitem(regimes._STREAM_TETS, dtype, 60)
+
+
+def pair(name: str, kernel: str, precision: str, **options: Any) -> tuple[pd.Simulator, pd.Simulator, pd.Simulator]:
+    """A scene on the GPU, on the CPU in the same precision, and there in float64."""
+    case, dtype = CASES[name](), DTYPES[precision]
+    sim = on_gpu(case, dtype, kernel, **options)
+    assert (sim.plan.patches > 1) == (kernel == "stream")
+    return sim, simulator(case, dtype, **options), simulator(case, torch.float64, **options)
+
+
+def different(sim: pd.Simulator, name: str, batch: int) -> tuple[pd.State, Tensor]:
+    """Environments no two of which are alike, on the CPU in the precision of `sim`, and forces."""
+    state = moved(state_of(CASES[name](), sim, batch), "cpu")
+    x, v = state
+    return pd.State(x + 0.002 * noise(x, 1), v + 0.1 * noise(v, 2)), 0.02 * noise(x, 3)
+
+
+def own_rows(sim: pd.Simulator, batch: int) -> dict[str, Tensor]:
+    """The effects of a scene, other ones in every environment."""
+    shades = torch.linspace(0.8, 1.25, batch, dtype=torch.float64)[:, None]
+    names = [name for name in sim.material_names if name in EFFECTS]
+    return {name: (shades * getattr(sim, name).detach().double().cpu()).to(sim.dtype) for name in names}
+
+
+def check(found: Tensor, cpu: Tensor, wide: Tensor, precision: str) -> None:
+    """As near to float64 as the CPU is: its rounding differs by the order of sums alone."""
+    assert torch.isfinite(found).all()
+    least = ROUNDED if precision == "float64" else 4.0 * relative(cpu, wide) + 2.0**-21
+    assert relative(found, wide) <= least
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 9, 40])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", CASES)
+def test_steps_are_those_of_the_cpu(name: str, kernel: str, iterations: int, precision: str) -> None:
+    sims = pair(name, kernel, precision, iterations=iterations)
+    for batch in (1, 7):
+        state, forces = different(sims[1], name, batch)
+        (one, info), (two, _), (wide, said) = (
+            sim(moved(state, sim.device, sim.dtype), forces.to(sim.device, sim.dtype), return_info=True) for sim in sims
+        )
+        check(one.velocities, two.velocities, wide.velocities, precision)
+        check(one.positions, two.positions, wide.positions, precision)
+        near = 1e-10 if precision == "float64" else 1e-3
+        assert relative(info.energy, said.energy) <= near
+        assert torch.equal(info.iterations.cpu(), said.iterations)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", CASES)
+def test_environments_have_rows_of_their_own(name: str, kernel: str, precision: str) -> None:
+    sims = pair(name, kernel, precision, iterations=12)
+    state, forces = different(sims[1], name, 7)
+    rows = own_rows(sims[1], 7)
+    for sim in sims:
+        sim.set_material(**{key: row.to(sim.device, sim.dtype) for key, row in rows.items()})
+    one, two, wide = (sim(moved(state, sim.device, sim.dtype), forces.to(sim.device, sim.dtype)) for sim in sims)
+    check(one.velocities, two.velocities, wide.velocities, precision)
+    assert not same_bits(
+        one, on_gpu(CASES[name](), sims[0].dtype, kernel, iterations=12)(moved(state, GPU), forces.to(GPU))
+    )
+
+
+@pytest.mark.parametrize("tolerance", [0.0, 0.3])
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "own rows"])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", ["sheet", "mixed"])
+def test_runs_and_batches_do_not_matter(name: str, kernel: str, own: bool, tolerance: float, precision: str) -> None:
+    batch = 700
+    case, dtype = CASES[name](), DTYPES[precision]
+    sim = on_gpu(case, dtype, kernel, iterations=14, tolerance=tolerance)
+    state, forces = different(sim, name, batch)
+    state, forces = moved(state, GPU), forces.to(GPU)
+    rows = {key: row.to(GPU) for key, row in own_rows(sim, batch).items()} if own else {}
+
+    def run(items: slice) -> list[Tensor]:
+        other = on_gpu(case, dtype, kernel, iterations=14, tolerance=tolerance)
+        if own:
+            other.set_material(**{key: row[items] for key, row in rows.items()})
+        after, info = other(pd.State(*(t[items] for t in state)), forces[items], return_info=True)
+        return [*after, *info]
+
+    together = run(slice(None))
+    for one, other in zip(run(slice(None)), together, strict=True):
+        assert torch.equal(one, other)
+    for item in (0, 1, 133, batch - 1):
+        for one, other in zip(run(slice(item, item + 1)), together, strict=True):
+            assert torch.equal(one, other[item : item + 1])
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_rollout_is_its_steps(kernel: str, precision: str) -> None:
+    sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=10)
+    state, forces = different(sim, "mixed", 5)
+    state, forces = moved(state, GPU), forces.to(GPU)
+    track = sim.rollout(state, 3, forces=forces)
+    for step in range(3):
+        state = sim(state, forces)
+        assert torch.equal(track.positions[step], state.positions)
+        assert torch.equal(track.velocities[step], state.velocities)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_replay_is_a_step_in_place(kernel: str, precision: str) -> None:
+    sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=10)
+    start, forces = different(sim, "mixed", 3)
+    own, eager = (moved(start, GPU) for _ in range(2))
+    eager = pd.State(*(t.clone() for t in eager))
+    forces = forces.to(GPU)
+    step = sim.capture(own, forces)
+    for number in range(1, 4):
+        forces.copy_(0.1 * noise(forces, number))
+        sim.bending.mul_(1.1)  # read anew too
+        step.replay()
+        sim.step_(eager, forces)
+        assert same_bits(own, eager)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_host_never_waits(kernel: str, precision: str) -> None:
+    sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=10)
+    state, _ = different(sim, "mixed", 3)
+    state = moved(state, GPU)
+    sim(state)
+    assert not host_waits(lambda: sim(state))
+
+
+def ops_of(sim: pd.Simulator, state: pd.State, along: Tensor) -> dict[str, list[Tensor]]:
+    """All fields of the elastic energy."""
+    ops, material, plan = torch.ops.torchpd, [t.detach() for t in sim.material()], list(sim.plan.arrays)
+    x, d = state.positions, along
+    return {
+        "gradient": [ops.gradient(x, material, plan)],
+        "hessian": [ops.hessian_product(x, d, material, plan)],
+        "diagonal": [ops.elastic_diagonal(material, plan, weighted=False)],
+        "weighted": [ops.elastic_diagonal(material, plan, weighted=True)],
+        "tets": [ops.element_energy(x, material, plan), ops.element_energy_product(x, d, material, plan)],
+        "energy": [ops.effect_energy(x, material, plan)],
+        "products": list(ops.effect_products(x, d, material, plan)),
+        "derivatives": list(ops.effect_products(x, None, material, plan)),
+        "at rest": [ops.stiffness_at_rest(material, plan)],
+    }
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "own rows"])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", CASES)
+def test_fields_are_those_of_the_cpu(name: str, kernel: str, own: bool, precision: str) -> None:
+    sims = pair(name, kernel, precision)
+    state, along = different(sims[1], name, 7)
+    rows = own_rows(sims[1], 7) if own else {}
+    found = []
+    for sim in sims:
+        if own:
+            sim.set_material(**{key: row.to(sim.device, sim.dtype) for key, row in rows.items()})
+        found.append(ops_of(sim, moved(state, sim.device, sim.dtype), along.to(sim.device, sim.dtype)))
+    for field, wide in found[2].items():
+        for number, expected in enumerate(wide):
+            if expected.numel():
+                one, two = (of[field][number] for of in found[:2])
+                assert one.shape == expected.shape, field
+                check(one, two, expected, precision)
+
+
+def gradients(
+    sim: pd.Simulator, state: pd.State, forces: Tensor, rows: dict[str, Tensor], weight: Tensor
+) -> dict[str, Tensor]:
+    """Of a loss after two steps, for the state, the forces and every array of the material."""
+    given = {name: getattr(sim, name).detach() for name in sim.material_names} | {
+        name: row.to(sim.device, sim.dtype) for name, row in rows.items()
+    }
+    given = {name: row.clone().requires_grad_() for name, row in given.items() if row.numel()}
+    starts = [t.to(sim.device, sim.dtype).clone().requires_grad_() for t in (*state, forces)]
+
+    def run() -> Tensor:
+        after = sim(sim(pd.State(starts[0], starts[1]), starts[2]), starts[2])
+        scale = weight.to(after.positions)
+        return (scale * after.positions).sum() + 0.01 * (scale * after.velocities).sum()
+
+    with torch.enable_grad():
+        loss = torch.func.functional_call(_Loss(sim, run), {f"sim.{name}": row for name, row in given.items()}, ())
+    names = ["positions", "velocities", "forces", *given]
+    return dict(zip(names, torch.autograd.grad(loss, [*starts, *given.values()]), strict=True))
+
+
+class _Loss(torch.nn.Module):
+    def __init__(self, sim: pd.Simulator, run: Any) -> None:
+        super().__init__()
+        self.sim, self.run = sim, run
+
+    def forward(self) -> Tensor:
+        found: Tensor = self.run()
+        return found
+
+
+@pytest.mark.parametrize("own", [False, True], ids=["shared", "own rows"])
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.filterwarnings("ignore:torchpd. the adjoint")
+def test_gradients_of_every_row_are_those_of_the_cpu(name: str, kernel: str, own: bool, precision: str) -> None:
+    sims = pair(name, kernel, precision, iterations=1500)
+    state, forces = different(sims[1], name, 3)
+    rows = own_rows(sims[1], 3) if own else {}
+    weight = noise(state.positions, 5)
+    one, two, wide = (gradients(sim, state, forces, rows, weight) for sim in sims)
+    assert one.keys() == wide.keys()
+    for key, expected in wide.items():
+        if not expected.abs().max() > 0.0:
+            assert not one[key].abs().max() > 0.0, key
+            continue
+        # both solve to the adjoint's tolerance
+        least = 1e-7 if precision == "float64" else 4.0 * relative(two[key], expected) + 1e-3
+        assert relative(one[key], expected) <= least, key
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_gradients_do_not_feel_their_batch(kernel: str, precision: str) -> None:
+    sim = on_gpu(sheet_case(), DTYPES[precision], kernel, iterations=200)
+    state, forces = different(sim, "sheet", 40)
+    rows, weight = own_rows(sim, 40), noise(state.positions, 5)
+    together = gradients(sim, state, forces, rows, weight)
+
+    def some(items: slice) -> dict[str, Tensor]:
+        start = pd.State(*(t[items] for t in state))
+        return gradients(sim, start, forces[items], {k: r[items] for k, r in rows.items()}, weight[items])
+
+    for items in (slice(0, 1), slice(17, 20), slice(0, 40)):
+        alone = some(items)
+        for key in ("positions", "velocities", "forces", *rows):
+            assert torch.equal(alone[key], together[key][items]), key
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_a_step_takes_what_it_is_said_to(kernel: str, precision: str) -> None:
+    sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=2)
+
+    def taken(batch: int) -> int:
+        state = sim.rest_state(batch)
+        sim.step_(state)
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats(GPU)
+        before = torch.cuda.memory_stats(GPU)["requested_bytes.all.current"]
+        sim.step_(state)
+        torch.cuda.synchronize()
+        peak: int = torch.cuda.memory_stats(GPU)["requested_bytes.all.peak"]
+        return peak - before - 8 * INFO_WIDTH * batch
+
+    for batch in (1, 7, 3000):
+        assert step_bytes(sim.compiled, sim.plan, batch, GPU) == taken(batch)
+    sim.set_material(**{name: row.to(GPU) for name, row in own_rows(sim, 7).items()})
+    assert step_bytes(sim.compiled, sim.plan, 7, GPU) == taken(7)
+
+
+def test_what_has_no_stencils_is_refused_by_name(precision: str) -> None:
+    case, dtype = sheet_case(), DTYPES[precision]
+    for kernel in ("cluster", "grid"):
+        with pytest.raises(ValueError, match=rf"kernel must be .*cloth.* got '{kernel}'; leave it"):
+            simulator(case, dtype, GPU, kernel=kernel)
+    with pytest.raises(ValueError, match=r"solver must be Chebyshev\(\) or Jacobi\(\) .*cloth.* got Multilevel"):
+        simulator(case, dtype, GPU, solver=pd.Multilevel("lbfgs"))
+    with pytest.raises(ValueError, match=r'adjoint="multilevel" needs a scene of solids alone'):
+        simulator(case, dtype, GPU, adjoint="multilevel", kernel="stream")
+
+
+def test_a_simulator_moves_there_and_back(precision: str) -> None:
+    case, dtype = mixed_case(), DTYPES[precision]
+    sim = simulator(case, dtype)
+    state = state_of(case, sim, 2)
+    before = sim(state)
+    sim.to("cuda")
+    assert sim.plan.kernel == "block"
+    sim(moved(state, GPU))
+    sim.to("cpu")
+    assert same_bits(sim(state), before)
