@@ -12,7 +12,6 @@ from device_plans import BLOCK, CLUSTER, GRID, LANES, NONE, SIZES, STREAM, Array
 from mixed_scenes import CASES, mixed_case, sheet_case
 from numpy.typing import NDArray
 
-import torchpd as pd
 from torchpd.common.gpu import Properties
 from torchpd.common.tables import DEVICE_PLAN_TABLE, DEVICE_STENCIL_TABLE, KINDS, MULTILEVEL_TABLE
 from torchpd.plan.gpu_plan import compile_device_plan, device_table

@@ -104,7 +104,7 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
         return compile_plan(values, dtype=dtype, progress=compiled.progress)
     if values.poisson is not None:
         raise RuntimeError(
-            f"Simulator: device must be the CPU for scenes with Poisson's ratio, which has no kernels for {device} yet; "
+            f"Simulator: device must be the CPU for scenes with Poisson's ratio, which has no kernels for {device}; "
             "keep it there, or leave poisson out"
         )
     return choose_plan(
