@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 def build_plan(
     positions: NDArray[float64],
     tets: NDArray[int64],
-    stencils: list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]],
+    stencils: list[
+        tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64], NDArray[int64] | None]
+    ],
     tet_group: NDArray[int64] | None,
     patch_size: int,
     progress: Callable[[float], None],
@@ -26,7 +28,9 @@ def build_device_plan(
 def build_multilevel(
     positions: NDArray[float64],
     tets: NDArray[int64],
-    stencils: list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]],
+    stencils: list[
+        tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64], NDArray[int64] | None]
+    ],
     vertex_order: NDArray[int32],
     stiffness: NDArray[float64],
     inertia: NDArray[float64],

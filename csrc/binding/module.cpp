@@ -66,19 +66,21 @@ void check_mesh(const Doubles& positions, const Indices& tets, bool others = fal
 struct KindShape {
   const char* name;
   int corners, dims, constants, numbers;
+  bool of_tets;  // whether it reads the material of tetrahedra
   std::vector<std::string> rows;
   const char* meaning;
 };
 
 std::vector<KindShape> kind_shapes() {
   std::vector<KindShape> kinds;
-#define KIND(name, type, what)          \
-  kinds.push_back({#name,               \
-                   pd::type::corners,   \
-                   pd::type::dims,      \
-                   pd::type::constants, \
-                   pd::type::numbers,   \
-                   {},                  \
+#define KIND(name, type, what)               \
+  kinds.push_back({#name,                    \
+                   pd::type::corners,        \
+                   pd::type::dims,           \
+                   pd::type::constants,      \
+                   pd::type::numbers,        \
+                   pd::reads_tets<pd::type>, \
+                   {},                       \
                    what});
 #define PARAMETER(name, array) kinds.back().rows.push_back(#array);
 #include "elements/kinds.def"
@@ -86,11 +88,27 @@ std::vector<KindShape> kind_shapes() {
   return kinds;
 }
 
-// Stencils of one kind as Python gives them: kind, corners, g_a, V, constants.
-using Stencils = std::tuple<int, Indices, Doubles, Doubles, Doubles>;
+// Stencils of one kind as Python gives them: kind, corners, g_a, V, constants, and the tetrahedron of each if the kind
+// reads its material.
+using Stencils = std::tuple<int, Indices, Doubles, Doubles, Doubles, std::optional<Indices>>;
 
-pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices) {
-  const auto& [kind, corner, gradient, measure, constant] = given;
+void check_tets_of(const KindShape& shape, const std::optional<Indices>& row, py::ssize_t count,
+                   std::int64_t tets) {
+  if (row.has_value() != shape.of_tets)
+    throw py::value_error(std::string(shape.name) + ": tetrahedra of stencils must be " +
+                          (shape.of_tets ? "given" : "None"));
+  if (!row) return;
+  if (row->ndim() != 1 || row->shape(0) != count)
+    throw py::value_error(std::string(shape.name) + ": tetrahedra of stencils must be [count]");
+  for (py::ssize_t i = 0; i < count; ++i) {
+    if (row->data()[i] < 0 || row->data()[i] >= tets)
+      throw py::index_error(std::string(shape.name) +
+                            ": stencils refer to tetrahedra that the mesh does not have");
+  }
+}
+
+pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std::int64_t tets) {
+  const auto& [kind, corner, gradient, measure, constant, row] = given;
   const std::vector<KindShape> shapes = kind_shapes();
   if (kind < 0 || kind >= std::ssize(shapes))
     throw py::value_error("the kind of stencils must be a row of kind_table");
@@ -112,8 +130,18 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices) {
       throw py::index_error(std::string(shape.name) +
                             ": corners refer to vertices that positions does not have");
   }
-  return {kind,  shape.corners, shape.dims,      shape.constants, shape.numbers,
-          count, corner.data(), gradient.data(), measure.data(),  constant.data()};
+  check_tets_of(shape, row, count, tets);
+  return {kind,
+          shape.corners,
+          shape.dims,
+          shape.constants,
+          shape.numbers,
+          count,
+          corner.data(),
+          gradient.data(),
+          measure.data(),
+          constant.data(),
+          row ? row->data() : nullptr};
 }
 
 // Checks the elements of a scene; the arrays stay the caller's.
@@ -122,7 +150,7 @@ pd::MeshElements mesh_elements(const Doubles& positions, const Indices& tets,
   check_mesh(positions, tets, !stencils.empty());
   pd::MeshElements elements{positions.data(), positions.shape(0), tets.data(), tets.shape(0)};
   for (const Stencils& group : stencils)
-    elements.groups.push_back(stencil_group(group, positions.shape(0)));
+    elements.groups.push_back(stencil_group(group, positions.shape(0), tets.shape(0)));
   return elements;
 }
 
@@ -149,8 +177,7 @@ pd::TetGroups tet_groups(const std::optional<Indices>& group, const Indices& tet
 
 py::dict build_plan(const Doubles& positions, const Indices& tets,
                     const std::vector<Stencils>& stencils, const std::optional<Indices>& tet_group,
-                    int patch_size,
-                    const std::function<void(double)>& progress) {
+                    int patch_size, const std::function<void(double)>& progress) {
   pd::MeshElements elements = mesh_elements(positions, tets, stencils);
   elements.averaged = tet_groups(tet_group, tets);
   if (patch_size < 16 || patch_size > 8192)
@@ -184,6 +211,7 @@ py::dict build_plan(const Doubles& positions, const Indices& tets,
   add("stencil_block", plan.stencil_block);
   add("patch_stencil", plan.patch_stencil);
   add("stencil_order", plan.stencil_order);
+  add("stencil_row", plan.stencil_row);
   add("stencil_measure", plan.stencil_measure);
   add("stencil_bound", plan.stencil_bound);
   add("stencil_corner", plan.stencil_corner);

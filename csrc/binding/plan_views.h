@@ -77,6 +77,12 @@ void view_stencils(Plan<T>& plan, at::TensorList arrays, int first, const Place&
   const int32* size = arrays[first].const_data_ptr<int32>();
   plan.stencil_blocks = size[stencil_blocks];
   plan.stencil_numbers = size[stencil_number_rows];
+  for (int kind = 0; kind < int(KindNumber::count); ++kind) {
+    with_kind(kind, [&](auto type) {
+      if (memory_of<decltype(type)> > 0 && size[stencil_size_count + kind] > 0)
+        plan.remembers = true;
+    });
+  }
   const StencilRows count{sizes, plan.stencil_blocks, plan.patches + 1, size[stencil_corner_rows],
                           size[stencil_stored_rows]};
   int at = first;
@@ -368,12 +374,16 @@ inline Tensor stiffness_of(at::TensorList material, std::int64_t tets) {
   return stiffness.contiguous();
 }
 
-inline void check_effect(at::TensorList material, std::string_view name, const char* kind,
-                         std::int64_t count) {
+// Arrays of tetrahedra may be absent: zeros.
+inline void check_effect(at::TensorList material, std::string_view name, int width, bool of_tets,
+                         const char* kind, std::int64_t count) {
   const Tensor& array = material[place_in_material(name)];
-  TORCH_CHECK_VALUE(array.dim() >= 1 && array.size(-1) == count, "material.", name,
-                    " must have a row for each of the ", count, " stencils of kind ", kind,
-                    " in the plan, got ", describe(array));
+  const int rows = width > 1 ? -2 : -1;
+  TORCH_CHECK_VALUE(
+      array.dim() >= -rows && (array.size(rows) == count || (of_tets && array.numel() == 0)),
+      "material.", name, " must have a row for each of the ", count,
+      of_tets ? " tetrahedra" : " stencils", of_tets ? ", which stencils" : "", " of kind ", kind,
+      of_tets ? " read, got " : " in the plan, got ", describe(array));
 }
 
 // Columns, where an array has any, are all of its numbers.
@@ -397,6 +407,22 @@ inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
   return t.size(width > 1 ? -2 : -1);
 }
 
+// Whether some stencils of a plan read an array of the material.
+inline bool stencils_read(at::TensorList plan, std::string_view name) {
+  const int others = int(plan.size()) - plan_arrays;
+  if (others != stencil_arrays && others != stencil_arrays + level_arrays) return false;
+  const Tensor& sizes = plan[plan_arrays];
+  constexpr int count = stencil_size_count + int(KindNumber::count);
+  if (!sizes.is_cpu() || sizes.numel() != count) return false;
+  const int32* const size = sizes.const_data_ptr<int32>() + stencil_size_count;
+  bool read = false;
+#define KIND(kind, type, what)
+#define PARAMETER(kind, array) read = read || (name == #array && size[int(KindNumber::kind)] > 0);
+#include "elements/kinds.def"
+#undef KIND
+  return read;
+}
+
 // Every stencil needs its row of each array that its kind reads.
 template <class T>
 void check_effects(const Plan<T>& plan, at::TensorList material) {
@@ -404,14 +430,20 @@ void check_effects(const Plan<T>& plan, at::TensorList material) {
   TORCH_CHECK_VALUE(material.size() == all_material_arrays, "material must be ",
                     all_material_arrays, " arrays for a plan with stencils, got ", material.size());
 #define KIND(kind, type, what)
-#define PARAMETER(kind, array)          \
-  check_effect(material, #array, #kind, \
-               plan.stencil_sizes[stencil_size_count + int(KindNumber::kind)]);
+#define PARAMETER(kind, array)                                                           \
+  if (const auto count = plan.stencil_sizes[stencil_size_count + int(KindNumber::kind)]) \
+    check_effect(material, #array, array##_numbers, is_of_tets(effect_##array), #kind,   \
+                 is_of_tets(effect_##array) ? plan.tets : count);
 #include "elements/kinds.def"
 #undef KIND
 }
 template <class T>
 void check_effects(const DevicePlan<T>&, at::TensorList) {}
+
+// Whether a material has stiffness-proportional damping.
+inline bool has_damping(at::TensorList material) {
+  return material.size() > material_arrays && array_of(material, "stiffness_damping").size(-1) > 0;
+}
 
 // Whether a material has Poisson's ratio.
 inline bool has_poisson(at::TensorList material) {
@@ -498,6 +530,7 @@ Material<T> material_view(const P& plan, at::TensorList arrays, std::int64_t bat
   material.planes_count = int(count.plane);
   material.spheres_count = int(count.sphere);
   material.effects = effects_view<P, T>(plan, arrays, batch, place);
+  material.effects.stiffness = material.stiffness;
   return material;
 }
 

@@ -60,6 +60,16 @@ class Kind(NamedTuple):
     rows: tuple[str, ...]  # names of its arrays in the material
     meaning: str
 
+    @property
+    def of_tets(self) -> bool:
+        """Whether these arrays have a row for every tetrahedron, so that the kind has none of its own."""
+        return any(row.name == self.rows[0] and row.rows == "tet" for row in MATERIAL_TABLE)
+
+    @property
+    def own_rows(self) -> tuple[str, ...]:
+        """Names of the arrays that have a row for each of its stencils."""
+        return () if self.of_tets else self.rows
+
 
 class SettingRow(NamedTuple):
     """A row of csrc/views/settings.def: a setting of a step."""
