@@ -206,8 +206,9 @@ Tensor effect_energy(const Tensor& positions, at::TensorList material, at::Tenso
 template <class Backend>
 Tensor lame_product(const Tensor& positions, const OptionalTensor& direction,
                     at::TensorList material, at::TensorList plan) {
-  TORCH_CHECK_VALUE(has_poisson(material), "material.poisson must be [tets] or [batch, tets] for "
-                                           "the derivatives by it, got none");
+  TORCH_CHECK_VALUE(has_poisson(material),
+                    "material.poisson must be [tets] or [batch, tets] for "
+                    "the derivatives by it, got none");
   return run_field<Backend>(Field::lame_product, positions, direction.value_or(Tensor()), material,
                             plan);
 }
