@@ -1,6 +1,7 @@
 // Elastic energy and its derivatives at given positions, and their diagonal, environment by environment.
 #pragma once
 #include "cpu/step/sweep.h"
+#include "elements/solid_fields.h"
 
 namespace pd::inline PD_TARGET {
 

@@ -326,10 +326,14 @@ PD_HD void each_element(const Plan<T>& plan, int patch, Elements elements, const
 template <class Visit>
 PD_HD void with_members(int members, const Visit& visit) {
   switch (members) {
-    case 0: return visit.template operator()<0>();
-    case 1: return visit.template operator()<1>();
-    case 2: return visit.template operator()<2>();
-    default: return visit.template operator()<4>();
+    case 0:
+      return visit.template operator()<0>();
+    case 1:
+      return visit.template operator()<1>();
+    case 2:
+      return visit.template operator()<2>();
+    default:
+      return visit.template operator()<4>();
   }
 }
 

@@ -32,7 +32,8 @@ void add_slots(MeshPlan& plan, const Numbering& n, const MeshElements& elements,
   }
   plan.patch_slot.push_back(std::int32_t(plan.slot_vertex.size()));
   if (plan.slot_vertex.size() - begin > std::numeric_limits<std::int16_t>::max())
-    throw std::invalid_argument("a patch has more vertices than 16 bits count: give a smaller patch_size");
+    throw std::invalid_argument(
+        "a patch has more vertices than 16 bits count: give a smaller patch_size");
 }
 
 // One lane of a block of tetrahedra.
