@@ -6,7 +6,7 @@ from typing import Any
 from numpy import float64, int32, int64
 from numpy.typing import NDArray
 
-Stencils = list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]]
+Stencils = list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64], NDArray[int64] | None]]
 
 def build_plan(
     positions: NDArray[float64],
@@ -29,7 +29,7 @@ def build_device_plan(
 def build_multilevel(
     positions: NDArray[float64],
     tets: NDArray[int64],
-    stencils: list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64]]],
+    stencils: Stencils,
     vertex_order: NDArray[int32],
     stiffness: NDArray[float64],
     inertia: NDArray[float64],
@@ -40,7 +40,7 @@ def build_multilevel(
 ) -> dict[str, NDArray[Any]]: ...
 def plan_table() -> list[tuple[str, str, int, str, str]]: ...
 def stencil_table() -> list[tuple[str, str, int, str, str]]: ...
-def kind_table() -> list[tuple[str, int, int, int, tuple[str, ...], str]]: ...
+def kind_table() -> list[tuple[str, int, int, int, tuple[str, ...], str, bool]]: ...
 def multilevel_table() -> list[tuple[str, str, int, str, str]]: ...
 def device_plan_table() -> list[tuple[str, str, int, str, str]]: ...
 def device_stencil_table() -> list[tuple[str, str, int, str, str]]: ...

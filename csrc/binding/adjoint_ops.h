@@ -188,7 +188,8 @@ struct AdjointSolution {
 // Iterates conjugate_gradients_, then the friction solve, until all environments have ended.
 template <class Backend>
 AdjointSolution iterate(const Tensor& positions, const AdjointSystem& s, at::TensorList material,
-                        at::TensorList plan, double tolerance) {
+                        at::TensorList plan, double tolerance, const OptionalTensor& start,
+                        double time_step) {
   const Tensor right = s.right.contiguous(), x = positions.contiguous();
   const Tensor solution = at::empty_like(right), direction = at::empty_like(right);
   const Tensor residual = right.clone();
@@ -196,9 +197,10 @@ AdjointSolution iterate(const Tensor& positions, const AdjointSystem& s, at::Ten
   const Tensor progress = at::full({x.size(0), progress_count}, -1.0, numbers);
   OptionalTensor friction;
   if (s.sliding) friction = at::zeros({x.size(0), friction_count}, numbers);
-  solve_conjugate<Backend>({solution, residual, direction, progress, x, s.inertia, s.inverse,
-                            s.projector, material, plan, s.sliding, right, friction},
-                           tolerance, (s.sliding ? 2 : 1) * adjoint_iterations);
+  solve_conjugate<Backend>(
+      {solution, residual, direction, progress, x, s.inertia, s.inverse, s.projector, material,
+       plan, s.sliding, right, friction, start, time_step},
+      tolerance, (s.sliding ? 2 : 1) * adjoint_iterations);
   return {solution, progress.select(1, progress_error),
           friction ? friction->select(1, friction_error) : Tensor()};
 }
@@ -208,11 +210,14 @@ std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Te
                                                const Tensor& inertia, const Tensor& inverse,
                                                const OptionalTensor& projector,
                                                at::TensorList material, at::TensorList plan,
-                                               const OptionalTensor& sliding, double tolerance) {
+                                               const OptionalTensor& sliding,
+                                               const OptionalTensor& start, double tolerance,
+                                               double time_step) {
   check_positions(positions, "positions");
   check_state(right, positions, "right", "N");
-  const AdjointSolution found = iterate<Backend>(
-      positions, {right, inertia, inverse, projector, sliding}, material, plan, tolerance);
+  const AdjointSolution found =
+      iterate<Backend>(positions, {right, inertia, inverse, projector, sliding}, material, plan,
+                       tolerance, start, time_step);
   return {found.solution,
           sliding ? at::maximum(found.error, found.friction) : found.error.contiguous()};
 }
@@ -223,11 +228,11 @@ inline Tensor apply_fallback(const AdjointTensors& t, const AdjointSystem& s, do
   static const auto op =
       find_op<Tensor(const Tensor&, const Tensor&, const OptionalTensor&, const Tensor&,
                      const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
-                     at::TensorList, double)>("torchpd::adjoint_fallback");
+                     at::TensorList, const OptionalTensor&, double)>("torchpd::adjoint_fallback");
   const OptionalTensor friction =
       found.friction.defined() ? OptionalTensor(found.friction) : OptionalTensor();
   return op.call(found.solution, found.error, friction, t.after, s.right, s.inverse, s.projector,
-                 t.material, t.plan, time_step);
+                 t.material, t.plan, start_of(t), time_step);
 }
 
 // Whether the solve of any environment has failed. One copy waits for a GPU, and takes less time than kernels that
@@ -247,7 +252,8 @@ std::tuple<Tensor, Tensor> solve(const AdjointTensors& t, const AdjointSystem& s
                                  double time_step) {
   const double tolerance =
       t.after.scalar_type() == at::kFloat ? adjoint_tolerance<float> : adjoint_tolerance<double>;
-  const AdjointSolution found = iterate<Backend>(t.after, s, t.material, t.plan, tolerance);
+  const AdjointSolution found =
+      iterate<Backend>(t.after, s, t.material, t.plan, tolerance, start_of(t), time_step);
   // a recording cannot read results, and does all of it
   const bool falls_back = Backend::recording(t.after) || some_failed(found, tolerance);
   return {falls_back ? apply_fallback(t, s, time_step, found) : found.solution, found.error};
@@ -287,16 +293,18 @@ std::vector<Tensor> step_vjp(const Tensor& grad_positions, const Tensor& grad_ve
   Tensor elastic;
   HeldTerms held_terms;
   if (touching) {
-    elastic = elastic_product(t, solution);
+    elastic = elastic_product(t, solution, time_step);
     held_terms = {grad_positions, elastic, projector, stuck, sliding};
   }
   auto [x, v, multiplier] = adjoint_result<Backend>(
       solution, error, grad_velocities, material, held_terms.grad_positions, held_terms.elastic,
       held_terms.projector, held_terms.stuck, held_terms.sliding, time_step);
   const LossMask loss_mask(grad_positions, grad_velocities);
+  const DampingProducts damping(t, multiplier, time_step);
+  if (damping.some()) x = x - damping.by_start();
   std::vector<Tensor> found{loss_mask.masked(x), loss_mask.masked(v), loss_mask.masked(multiplier)};
   const MaterialGradients gradients(
-      t, multiplier, elastic,
+      t, multiplier, elastic, damping,
       [&, l = multiplier](const Tensor& product) {
         const auto wants = [&](const char* name) {
           return !wanted || wanted->get(place_in_material(name));

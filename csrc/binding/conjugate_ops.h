@@ -2,6 +2,7 @@
 #pragma once
 #include "binding/checks.h"
 #include "binding/plan_views.h"
+#include "binding/settings.h"
 
 #include <cstdint>
 #include <limits>
@@ -16,6 +17,8 @@ struct ConjugateTensors {
   OptionalTensor projector;
   at::TensorList material, plan;
   OptionalTensor sliding, right, friction;  // all or none
+  OptionalTensor start = {};                // of the step whose dissipation counts
+  double time_step = 0;
 };
 
 template <class Backend, class T>
@@ -27,6 +30,11 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
   const Tensor x = t.positions.contiguous();
+  const Tensor start = t.start ? t.start->contiguous() : Tensor();
+  if (start.defined()) {
+    call.start = start.const_data_ptr<T>();
+    call.per_time = T(1 / t.time_step);
+  }
   const Tensor w = stiffness_of(t.material, call.plan.tets);
   const Tensor a = t.inertia.contiguous(), inverse = t.inverse.contiguous();
   const Tensor p = t.projector ? t.projector->contiguous() : Tensor();
@@ -47,6 +55,7 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   const EffectArrays<T> effects(Backend::stencil_counts(call), call.plan.tets, t.material,
                                 call.batch, place);
   call.effects = effects.view;
+  call.effects.stiffness = call.stiffness;
   call.inertia = of_vertices(a, "inertia", "N/m");
   call.inverse = of_vertices(inverse, "inverse", "of the diagonal [m/N], 0 for what is held");
   call.positions = x.const_data_ptr<T>();
@@ -70,6 +79,10 @@ void solve_conjugate(const ConjugateTensors& t, double tolerance, std::int64_t i
   if (t.projector) check_projector(*t.projector, t.positions);
   if (t.sliding) check_sliding(*t.sliding, t.positions);
   TORCH_CHECK_VALUE(tolerance >= 0, "tolerance must be >= 0, got ", tolerance);
+  if (t.start) {
+    check_state(*t.start, t.positions, "start", "positions at the start of the step, m");
+    CheckSetting::time_step(t.time_step);
+  }
   if (t.positions.scalar_type() == at::kFloat) {
     conjugate_typed<Backend, float>(t, tolerance, iterations);
   } else {
@@ -82,8 +95,9 @@ void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
                                  const Tensor& direction, const Tensor& progress,
                                  const Tensor& positions, const Tensor& inertia,
                                  const Tensor& inverse, const OptionalTensor& projector,
-                                 at::TensorList material, at::TensorList plan, double tolerance,
-                                 std::int64_t iterations) {
+                                 at::TensorList material, at::TensorList plan,
+                                 const OptionalTensor& start, double tolerance,
+                                 std::int64_t iterations, double time_step) {
   check_positions(positions, "positions");
   const Place place{positions.device()};
   const auto check_vectors = [&](const Tensor& t, const char* name, const char* meaning) {
@@ -100,7 +114,7 @@ void conjugate_gradients_inplace(const Tensor& solution, const Tensor& residual,
                     "iterations must be in [0, 2^31), got ", iterations);
   const OptionalTensor none;
   solve_conjugate<Backend>({solution, residual, direction, progress, positions, inertia, inverse,
-                            projector, material, plan, none, none, none},
+                            projector, material, plan, none, none, none, start, time_step},
                            tolerance, iterations);
   for (const Tensor& t : {solution, residual, direction, progress}) {
     if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();

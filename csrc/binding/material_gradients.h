@@ -16,12 +16,34 @@
 
 namespace pd {
 
-// K l, through the dispatcher, so that its profiler sees it.
-inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier) {
+// Derivatives of l . (gradient of what a step dissipates), through the dispatcher.
+class DampingProducts {
+ public:
+  DampingProducts(const AdjointTensors& t, const Tensor& multiplier, double time_step) {
+    if (!has_damping(t.material)) return;
+    static const auto op =
+        find_op<std::vector<Tensor>(const Tensor&, const Tensor&, const Tensor&, at::TensorList,
+                                    at::TensorList, double)>("torchpd::damping_vjp");
+    found_ = op.call(t.after, t.positions, multiplier, t.material, t.plan, time_step);
+  }
+  bool some() const { return !found_.empty(); }
+  const Tensor& by_positions() const { return found_[0]; }
+  const Tensor& by_start() const { return found_[1]; }
+  // by the stiffness, then by each array of the effects
+  const Tensor& by_array(std::size_t number) const { return found_[2 + number]; }
+
+ private:
+  std::vector<Tensor> found_;
+};
+
+// K l, through the dispatcher, so that its profiler sees it. Damping adds to K.
+inline Tensor elastic_product(const AdjointTensors& t, const Tensor& multiplier, double time_step) {
   static const auto op =
       find_op<Tensor(const Tensor&, const Tensor&, at::TensorList, at::TensorList)>(
           "torchpd::hessian_product");
-  return op.call(t.after, multiplier, t.material, t.plan);
+  const Tensor elastic = op.call(t.after, multiplier, t.material, t.plan);
+  const DampingProducts damping(t, multiplier, time_step);
+  return damping.some() ? elastic + damping.by_positions() : elastic;
 }
 
 // Environments that the loss depends on. A NaN environment that the loss leaves out must not spoil shared gradients.
@@ -110,10 +132,12 @@ class MaterialGradients {
   using Contacts = std::function<std::tuple<Tensor, Tensor>(const Tensor& elastic)>;
   using Sum = Tensor (*)(const Tensor& values);
   MaterialGradients(const AdjointTensors& t, const Tensor& multiplier, const Tensor& elastic,
-                    Contacts contacts, Sum sum, const LossMask& loss_mask, double time_step)
+                    const DampingProducts& damping, Contacts contacts, Sum sum,
+                    const LossMask& loss_mask, double time_step)
       : t_(t),
         multiplier_(multiplier),
         elastic_(elastic),
+        damping_products_(damping),
         contacts_(std::move(contacts)),
         sum_(sum),
         loss_mask_(loss_mask),
@@ -153,20 +177,25 @@ class MaterialGradients {
 
   // K l; one computed earlier may lack the NaN of a failed environment
   Tensor product() const {
-    return elastic_.defined() ? elastic_ + 0.0 * multiplier_ : elastic_product(t_, multiplier_);
+    return elastic_.defined() ? elastic_ + 0.0 * multiplier_ : elastic_product(t_, multiplier_, h_);
   }
 
   // the part that held vertices pass on
   Tensor held_gradient() const { return t_.grad_positions + t_.grad_velocities / h_ - product(); }
 
   Tensor stiffness() const {
-    if (has_poisson(t_.material)) return -of_lame().select(-1, 0);
+    const Tensor elastic = -of_tets();
+    return damping_products_.some() ? elastic - damping_products_.by_array(0) : elastic;
+  }
+
+  Tensor of_tets() const {
+    if (has_poisson(t_.material)) return of_lame().select(-1, 0);
     static const auto op =
         find_op<Tensor(const Tensor&, const Tensor&, at::TensorList, at::TensorList)>(
             "torchpd::element_energy_product");
     std::vector<Tensor> unit(t_.material.begin(), t_.material.end());
     unit[place_in_material("stiffness")] = at::ones_like(material("stiffness"));
-    return -op.call(t_.after, multiplier_, unit, t_.plan);
+    return op.call(t_.after, multiplier_, unit, t_.plan);
   }
 
   // by E and nu
@@ -179,6 +208,11 @@ class MaterialGradients {
   }
 
   Tensor of_effects(std::size_t number) const {
+    const Tensor elastic = elastic_effects(number);
+    return damping_products_.some() ? elastic + damping_products_.by_array(1 + number) : elastic;
+  }
+
+  Tensor elastic_effects(std::size_t number) const {
     if (number + material_arrays == place_in_material("poisson") && has_poisson(t_.material))
       return of_lame().select(-1, 1);
     static const auto op =
@@ -220,6 +254,7 @@ class MaterialGradients {
   const AdjointTensors& t_;
   const Tensor& multiplier_;
   const Tensor& elastic_;
+  const DampingProducts& damping_products_;
   Contacts contacts_;
   Sum sum_;
   const LossMask& loss_mask_;

@@ -66,31 +66,51 @@ void check_mesh(const Doubles& positions, const Indices& tets, bool others = fal
 struct KindShape {
   const char* name;
   int corners, dims, constants, numbers;
+  bool of_tets;  // whether it reads the material of tetrahedra
   std::vector<std::string> rows;
   const char* meaning;
+  bool on_gpu;  // whether a GPU has kernels for it
 };
 
 std::vector<KindShape> kind_shapes() {
   std::vector<KindShape> kinds;
-#define KIND(name, type, what)          \
-  kinds.push_back({#name,               \
-                   pd::type::corners,   \
-                   pd::type::dims,      \
-                   pd::type::constants, \
-                   pd::type::numbers,   \
-                   {},                  \
-                   what});
+#define KIND(name, type, what)               \
+  kinds.push_back({#name,                    \
+                   pd::type::corners,        \
+                   pd::type::dims,           \
+                   pd::type::constants,      \
+                   pd::type::numbers,        \
+                   pd::reads_tets<pd::type>, \
+                   {},                       \
+                   what,                     \
+                   pd::runs_on_gpu<pd::type>});
 #define PARAMETER(name, array) kinds.back().rows.push_back(#array);
 #include "elements/kinds.def"
 #undef KIND
   return kinds;
 }
 
-// Stencils of one kind as Python gives them: kind, corners, g_a, V, constants.
-using Stencils = std::tuple<int, Indices, Doubles, Doubles, Doubles>;
+// Stencils of one kind as Python gives them: kind, corners, g_a, V, constants, and the tetrahedron of each if the kind
+// reads its material.
+using Stencils = std::tuple<int, Indices, Doubles, Doubles, Doubles, std::optional<Indices>>;
 
-pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices) {
-  const auto& [kind, corner, gradient, measure, constant] = given;
+void check_tets_of(const KindShape& shape, const std::optional<Indices>& row, py::ssize_t count,
+                   std::int64_t tets) {
+  if (row.has_value() != shape.of_tets)
+    throw py::value_error(std::string(shape.name) + ": tetrahedra of stencils must be " +
+                          (shape.of_tets ? "given" : "None"));
+  if (!row) return;
+  if (row->ndim() != 1 || row->shape(0) != count)
+    throw py::value_error(std::string(shape.name) + ": tetrahedra of stencils must be [count]");
+  for (py::ssize_t i = 0; i < count; ++i) {
+    if (row->data()[i] < 0 || row->data()[i] >= tets)
+      throw py::index_error(std::string(shape.name) +
+                            ": stencils refer to tetrahedra that the mesh does not have");
+  }
+}
+
+pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std::int64_t tets) {
+  const auto& [kind, corner, gradient, measure, constant, row] = given;
   const std::vector<KindShape> shapes = kind_shapes();
   if (kind < 0 || kind >= std::ssize(shapes))
     throw py::value_error("the kind of stencils must be a row of kind_table");
@@ -112,8 +132,18 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices) {
       throw py::index_error(std::string(shape.name) +
                             ": corners refer to vertices that positions does not have");
   }
-  return {kind,  shape.corners, shape.dims,      shape.constants, shape.numbers,
-          count, corner.data(), gradient.data(), measure.data(),  constant.data()};
+  check_tets_of(shape, row, count, tets);
+  return {kind,
+          shape.corners,
+          shape.dims,
+          shape.constants,
+          shape.numbers,
+          count,
+          corner.data(),
+          gradient.data(),
+          measure.data(),
+          constant.data(),
+          row ? row->data() : nullptr};
 }
 
 // Checks the elements of a scene; the arrays stay the caller's.
@@ -122,7 +152,7 @@ pd::MeshElements mesh_elements(const Doubles& positions, const Indices& tets,
   check_mesh(positions, tets, !stencils.empty());
   pd::MeshElements elements{positions.data(), positions.shape(0), tets.data(), tets.shape(0)};
   for (const Stencils& group : stencils)
-    elements.groups.push_back(stencil_group(group, positions.shape(0)));
+    elements.groups.push_back(stencil_group(group, positions.shape(0), tets.shape(0)));
   constexpr std::int64_t most = std::int64_t(1) << 28;
   if (elements.count() > most)
     throw py::value_error("a scene may have up to 2^28 = " + std::to_string(most) +
@@ -193,6 +223,7 @@ py::dict build_plan(const Doubles& positions, const Indices& tets,
   add("stencil_block", plan.stencil_block);
   add("patch_stencil", plan.patch_stencil);
   add("stencil_order", plan.stencil_order);
+  add("stencil_row", plan.stencil_row);
   add("stencil_measure", plan.stencil_measure);
   add("stencil_bound", plan.stencil_bound);
   add("stencil_corner", plan.stencil_corner);
@@ -339,7 +370,7 @@ py::list kind_table() {
   py::list rows;
   for (const KindShape& kind : kind_shapes())
     rows.append(py::make_tuple(kind.name, kind.corners, kind.dims, kind.constants,
-                               py::tuple(py::cast(kind.rows)), kind.meaning));
+                               py::tuple(py::cast(kind.rows)), kind.meaning, kind.on_gpu));
   return rows;
 }
 
@@ -454,7 +485,7 @@ PYBIND11_MODULE(_C, m) {
       "stencil_table", [] { return table(stencil_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays of stencils, in op order.");
   m.def("kind_table", &kind_table,
-        "Rows (name, corners, dims, constants, arrays, meaning) of the kinds of stencils.");
+        "Rows (name, corners, dims, constants, arrays, meaning, on_gpu) of the kinds of stencils.");
   m.def(
       "multilevel_table", [] { return table(multilevel_rows); },
       "Rows (name, type, width, rows, meaning) of a preconditioner's arrays, in op order.");

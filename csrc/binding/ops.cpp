@@ -147,8 +147,19 @@ TORCH_LIBRARY(torchpd, m) {
   with_plan(
       "effect_products(Tensor positions, Tensor? direction, Tensor[] material, Tensor[] plan) -> "
       "Tensor[]");
-  with_plan("elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted) -> Tensor");
-  with_plan("stiffness_at_rest(Tensor[] material, Tensor[] plan) -> Tensor");
+  with_plan(
+      "damping_gradient(Tensor positions, Tensor start, Tensor[] material, Tensor[] plan, *, float "
+      "time_step) -> Tensor");
+  with_plan(
+      "damping_vjp(Tensor positions, Tensor start, Tensor direction, Tensor[] material, Tensor[] "
+      "plan, *, float time_step) -> Tensor[]");
+  // with a time step also that of the energies that a step dissipates
+  with_plan(
+      "elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted, float time_step=0.0) "
+      "-> "
+      "Tensor");
+  with_plan(
+      "stiffness_at_rest(Tensor[] material, Tensor[] plan, *, float time_step=0.0) -> Tensor");
   with_plan("precondition(Tensor field, Tensor[] plan) -> Tensor");
   with_plan(
       "step_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor positions, "
@@ -162,9 +173,8 @@ TORCH_LIBRARY(torchpd, m) {
   // its kernel, for every device, comes from Python
   with_plan(
       "adjoint_fallback(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor "
-      "right, "
-      "Tensor inverse, "
-      "Tensor? projector, Tensor[] material, Tensor[] plan, *, float time_step) -> Tensor");
+      "right, Tensor inverse, Tensor? projector, Tensor[] material, Tensor[] plan, Tensor? "
+      "start=None, *, float time_step) -> Tensor");
   with_plan(
       "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
       "positions, Tensor "
@@ -182,13 +192,16 @@ TORCH_LIBRARY(torchpd, m) {
       "stuck=None, Tensor? sliding=None, *, float time_step) -> (Tensor, Tensor, Tensor)");
   with_plan(
       "conjugate_gradients(Tensor positions, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
-      "projector, Tensor[] material, Tensor[] plan, Tensor? sliding=None, *, float tolerance) -> "
+      "projector, Tensor[] material, Tensor[] plan, Tensor? sliding=None, Tensor? start=None, *, "
+      "float "
+      "tolerance, float time_step=0.0) -> "
       "(Tensor, Tensor)");
   with_plan(
       "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
       "Tensor(d!) "
       "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor[] "
-      "material, Tensor[] plan, *, float tolerance, int iterations) -> ()");
+      "material, Tensor[] plan, Tensor? start=None, *, float tolerance, int iterations, float "
+      "time_step=0.0) -> ()");
   m.def("nearest_rotation(Tensor matrices) -> Tensor");
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }

@@ -43,6 +43,7 @@ void step_typed(const StepTensors& t, const Settings& settings) {
   call.material = material_view<T>(call.plan, t.material, call.batch, place);
   call.effects =
       effects_view<T>(Backend::stencil_counts(call), call.plan.tets, t.material, call.batch, place);
+  call.effects.stiffness = call.material.stiffness;
   check_tets(t.material[0], call.plan.tets);
   call.settings = settings;
   const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
@@ -145,10 +146,22 @@ Outputs rollout(const Numbers& n, const Tensor& positions, const Tensor& velocit
   return {x, v, info};
 }
 
+// The step that a field belongs to: energies that it dissipates count, with the positions at its start.
+struct StepOfField {
+  double time_step = 0;  // none
+  Tensor start = {};     // undefined: `positions` are those at the start
+
+  template <class T>
+  T per_time() const {
+    return time_step > 0 ? T(1 / time_step) : T(0);
+  }
+};
+
 template <class Backend, class T>
 void field_typed(Field field, const Tensor& positions, const Tensor& direction,
                  at::TensorList material, at::TensorList plan, const Tensor& out,
-                 const Tensor& displacement = {}, const std::vector<Tensor>& products = {}) {
+                 const Tensor& displacement = {}, const std::vector<Tensor>& products = {},
+                 const StepOfField& step = {}) {
   typename Backend::template Field<T> call;
   const Place place{positions.device()};
   call.plan = Backend::template plan_view<T>(plan, place);
@@ -156,26 +169,30 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
   call.field = field;
   call.batch = positions.size(0);
   check_vertices(positions, call.plan.vertices);
-  const Tensor w = stiffness_of(material, call.plan.tets), x = positions.contiguous();
+  const Tensor w = stiffness_of(material, call.plan.tets);
+  const Tensor x = (step.start.defined() ? step.start : positions).contiguous();
+  const Tensor u = step.start.defined() ? positions - step.start : displacement;
   const Tensor d = direction.defined() ? direction.contiguous() : Tensor();
+  call.per_time = step.template per_time<T>();
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
   const EffectArrays<T> effects(Backend::stencil_counts(call), call.plan.tets, material, call.batch,
                                 place);
   call.effects = effects.view;
+  call.effects.stiffness = call.stiffness;
   for (std::size_t i = 0; i < products.size(); ++i) {
     if (products[i].numel() > 0) call.products[i] = products[i].template mutable_data_ptr<T>();
   }
   call.positions = x.const_data_ptr<T>();
   call.direction = d.defined() ? d.const_data_ptr<T>() : nullptr;
-  call.displacement = displacement.defined() ? displacement.const_data_ptr<T>() : nullptr;
+  call.displacement = u.defined() ? u.const_data_ptr<T>() : nullptr;
   call.out = out.mutable_data_ptr<T>();
   if (call.batch > 0) Backend::field(call, out);
 }
 
 template <class Backend>
 Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
-                 at::TensorList material, at::TensorList plan) {
+                 at::TensorList material, at::TensorList plan, const StepOfField& step = {}) {
   check_positions(positions, "positions");
   if (direction.defined()) check_state(direction, positions, "direction", "m");
   const bool per_element = field == Field::element_energy || field == Field::element_energy_product;
@@ -187,9 +204,9 @@ Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
   if (field == Field::lame_product) shape = {positions.size(0), stiffness.size(-1), 2};
   const Tensor out = at::empty(shape, positions.options());
   if (positions.scalar_type() == at::kFloat) {
-    field_typed<Backend, float>(field, positions, direction, material, plan, out);
+    field_typed<Backend, float>(field, positions, direction, material, plan, out, {}, {}, step);
   } else {
-    field_typed<Backend, double>(field, positions, direction, material, plan, out);
+    field_typed<Backend, double>(field, positions, direction, material, plan, out, {}, {}, step);
   }
   return out;
 }
@@ -207,43 +224,107 @@ Tensor effect_energy(const Tensor& positions, at::TensorList material, at::Tenso
   return out;
 }
 
-// Derivatives by Young's modulus and Poisson's ratio of every tetrahedron [batch, tets, 2]: of the gradient's product with
-// a direction, or else of the energy.
+// The place of Poisson's ratio in stencil_products.
+constexpr std::size_t poisson_product = 1 + place_in_material("poisson") - material_arrays;
+
+// What stencils add to the derivatives by the stiffness and by each array of the effects, [batch, rows] or [batch, rows,
+// width]: of the gradient's product with a direction, or else of the energy.
+template <class Backend>
+std::vector<Tensor> stencil_products(Field field, const Tensor& positions, const Tensor& along,
+                                     at::TensorList material, at::TensorList plan,
+                                     const StepOfField& step = {}) {
+  std::vector<Tensor> products;
+  const auto add = [&](std::size_t place, int width) {
+    std::vector<std::int64_t> shape =
+        material[place]
+            .sizes()
+            .slice(std::max<std::int64_t>(0, material[place].dim() - (width > 1 ? 2 : 1)))
+            .vec();
+    shape.insert(shape.begin(), positions.size(0));
+    products.push_back(at::zeros(shape, positions.options()));
+  };
+  add(place_in_material("stiffness"), 1);
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning) \
+  if (material.size() > material_arrays) add(place_in_material(#name), width);
+#include "views/material.def"
+#undef X
+  const Tensor out = at::empty({0}, positions.options());
+  if (positions.scalar_type() == at::kFloat) {
+    field_typed<Backend, float>(field, positions, along, material, plan, out, {}, products, step);
+  } else {
+    field_typed<Backend, double>(field, positions, along, material, plan, out, {}, products, step);
+  }
+  return products;
+}
+
+// Derivatives by Young's modulus and Poisson's ratio of every tetrahedron [batch, tets, 2], from its own energy and
+// that of stencils that read them: of the gradient's product with a direction, or else of the energy.
 template <class Backend>
 Tensor lame_product(const Tensor& positions, const OptionalTensor& direction,
                     at::TensorList material, at::TensorList plan) {
   TORCH_CHECK_VALUE(has_poisson(material),
                     "material.poisson must be [tets] or [batch, tets] for "
                     "the derivatives by it, got none");
-  return run_field<Backend>(Field::lame_product, positions, direction.value_or(Tensor()), material,
-                            plan);
+  const Tensor along = direction.value_or(Tensor());
+  const Tensor found = run_field<Backend>(Field::lame_product, positions, along, material, plan);
+  if (!stencils_read(plan, "poisson")) return found;
+  const std::vector<Tensor> stencils =
+      stencil_products<Backend>(Field::effect_products, positions, along, material, plan);
+  return found + at::stack({stencils[0], stencils[poisson_product]}, -1);
 }
 
-// Derivatives by each array of the effects, [batch, rows]: of the gradient's product with a direction, or else of the
-// energy.
+// Derivatives by each array of the effects, [batch, rows] or [batch, rows, width]: of the gradient's product with a
+// direction, or else of the energy.
 template <class Backend>
 std::vector<Tensor> effect_products(const Tensor& positions, const OptionalTensor& direction,
                                     at::TensorList material, at::TensorList plan) {
   check_positions(positions, "positions");
   check_material_size(material);
   if (direction) check_state(*direction, positions, "direction", "m");
-  const Tensor along = direction ? *direction : Tensor();
-  std::vector<Tensor> products;
-  for (std::size_t i = material_arrays; i < material.size(); ++i) {
-    products.push_back(at::zeros({positions.size(0), material[i].size(-1)}, positions.options()));
-  }
-  const Tensor out = at::empty({0}, positions.options());
-  const Field field = Field::effect_products;
-  if (positions.scalar_type() == at::kFloat) {
-    field_typed<Backend, float>(field, positions, along, material, plan, out, {}, products);
-  } else {
-    field_typed<Backend, double>(field, positions, along, material, plan, out, {}, products);
-  }
+  const Tensor along = direction.value_or(Tensor());
+  std::vector<Tensor> products =
+      stencil_products<Backend>(Field::effect_products, positions, along, material, plan);
   if (has_poisson(material)) {
-    products[place_in_material("poisson") - material_arrays] =
-        lame_product<Backend>(positions, direction, material, plan).select(-1, 1);
+    products[poisson_product] +=
+        run_field<Backend>(Field::lame_product, positions, along, material, plan).select(-1, 1);
   }
+  products.erase(products.begin());
   return products;
+}
+
+// Checks of the ops of energies that a step dissipates.
+inline void check_damping(const Tensor& positions, const Tensor& start, double time_step) {
+  check_positions(positions, "positions");
+  check_state(start, positions, "start", "positions at the start of the step, m");
+  CheckSetting::time_step(time_step);
+}
+
+// Gradient of the energies that a step of this length dissipates from its start.
+template <class Backend>
+Tensor damping_gradient(const Tensor& positions, const Tensor& start, at::TensorList material,
+                        at::TensorList plan, double time_step) {
+  check_damping(positions, start, time_step);
+  return run_field<Backend>(Field::damping_gradient, positions, {}, material, plan,
+                            {time_step, start});
+}
+
+// Derivatives of that gradient's product with a direction: by positions, by start, then in the order of
+// stencil_products.
+template <class Backend>
+std::vector<Tensor> damping_vjp(const Tensor& positions, const Tensor& start,
+                                const Tensor& direction, at::TensorList material,
+                                at::TensorList plan, double time_step) {
+  check_damping(positions, start, time_step);
+  check_state(direction, positions, "direction", "m");
+  const StepOfField step{time_step, start};
+  std::vector<Tensor> found{
+      run_field<Backend>(Field::damping_product, positions, direction, material, plan, step),
+      run_field<Backend>(Field::damping_start, positions, direction, material, plan, step)};
+  for (const Tensor& product : stencil_products<Backend>(Field::damping_products, positions,
+                                                         direction, material, plan, step))
+    found.push_back(product);
+  return found;
 }
 
 template <class Backend>
@@ -269,7 +350,8 @@ Tensor element_energy_product(const Tensor& positions, const Tensor& direction,
 }
 
 template <class Backend, class T>
-Tensor material_field(Field field, at::TensorList material, at::TensorList plan, bool weighted) {
+Tensor material_field(Field field, at::TensorList material, at::TensorList plan, bool weighted,
+                      double time_step) {
   typename Backend::template Field<T> call;
   const Tensor& stiffness = array_of(material, "stiffness");
   const Place place{stiffness.device(), "stiffness"};
@@ -277,6 +359,7 @@ Tensor material_field(Field field, at::TensorList material, at::TensorList plan,
   Backend::view_stencils(call, plan, place);
   call.field = field;
   call.weighted = weighted;
+  call.per_time = StepOfField{time_step}.per_time<T>();
   const Tensor w = stiffness_of(material, call.plan.tets);
   const std::optional<std::int64_t> own = environments_of(material);
   const bool batched = own.has_value();
@@ -292,36 +375,39 @@ Tensor material_field(Field field, at::TensorList material, at::TensorList plan,
       batched ? at::empty({call.batch, rows}, w.options()) : at::empty({rows}, w.options());
   call.stiffness = values_view<T>(w, call.plan.tets, 1, false, call.batch, place, "stiffness",
                                   "Young's modulus [Pa]");
+  call.effects.stiffness = call.stiffness;
   call.out = out.mutable_data_ptr<T>();
   if (call.batch > 0) Backend::field(call, out);
   return out;
 }
 
 template <class Backend, class T>
-Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighted) {
-  return material_field<Backend, T>(Field::diagonal, material, plan, weighted);
+Tensor diagonal_typed(at::TensorList material, at::TensorList plan, bool weighted,
+                      double time_step) {
+  return material_field<Backend, T>(Field::diagonal, material, plan, weighted, time_step);
 }
 
 template <class Backend>
-Tensor elastic_diagonal(at::TensorList material, at::TensorList plan, bool weighted) {
+Tensor elastic_diagonal(at::TensorList material, at::TensorList plan, bool weighted,
+                        double time_step) {
   const Tensor& stiffness = array_of(material, "stiffness");
   check_real(stiffness, "stiffness", "[tets] or [batch, tets] (Pa)");
   return stiffness.scalar_type() == at::kFloat
-             ? diagonal_typed<Backend, float>(material, plan, weighted)
-             : diagonal_typed<Backend, double>(material, plan, weighted);
+             ? diagonal_typed<Backend, float>(material, plan, weighted, time_step)
+             : diagonal_typed<Backend, double>(material, plan, weighted, time_step);
 }
 
 // Stiffness of every element at rest, as a preconditioner takes it, [elements] or [batch, elements]: that of
 // tetrahedra [Pa], then that of stencils kind by kind.
 template <class Backend>
-Tensor stiffness_at_rest(at::TensorList material, at::TensorList plan) {
+Tensor stiffness_at_rest(at::TensorList material, at::TensorList plan, double time_step) {
   const Tensor& stiffness = array_of(material, "stiffness");
   check_real(stiffness, "stiffness", "[tets] or [batch, tets] (Pa)");
   if (material.size() == material_arrays) return stiffness.clone();
   const Field field = Field::stiffness_at_rest;
   return stiffness.scalar_type() == at::kFloat
-             ? material_field<Backend, float>(field, material, plan, false)
-             : material_field<Backend, double>(field, material, plan, false);
+             ? material_field<Backend, float>(field, material, plan, false, time_step)
+             : material_field<Backend, double>(field, material, plan, false, time_step);
 }
 
 template <class Backend, class T>
@@ -376,12 +462,12 @@ Tensor run_rotation(const Tensor& matrices, const Tensor& direction) {
 }
 
 template <class Backend>
-Tensor nearest_rotation(const Tensor& matrices) {
+Tensor rotations_of(const Tensor& matrices) {
   return run_rotation<Backend>(matrices, {});
 }
 
 template <class Backend>
-Tensor rotation_differential(const Tensor& matrices, const Tensor& direction) {
+Tensor rotation_differentials_of(const Tensor& matrices, const Tensor& direction) {
   return run_rotation<Backend>(matrices, direction);
 }
 
@@ -397,12 +483,14 @@ void register_ops(torch::Library& m) {
   m.impl("effect_energy", &effect_energy<Backend>);
   m.impl("lame_product", &lame_product<Backend>);
   m.impl("effect_products", &effect_products<Backend>);
+  m.impl("damping_gradient", &damping_gradient<Backend>);
+  m.impl("damping_vjp", &damping_vjp<Backend>);
   m.impl("elastic_diagonal", &elastic_diagonal<Backend>);
   m.impl("stiffness_at_rest", &stiffness_at_rest<Backend>);
   m.impl("precondition", &precondition<Backend>);
   m.impl("conjugate_gradients_", &conjugate_gradients_inplace<Backend>);
-  m.impl("nearest_rotation", &nearest_rotation<Backend>);
-  m.impl("rotation_differential", &rotation_differential<Backend>);
+  m.impl("nearest_rotation", &rotations_of<Backend>);
+  m.impl("rotation_differential", &rotation_differentials_of<Backend>);
 }
 
 }  // namespace pd

@@ -92,6 +92,12 @@ void view_stencils(Plan<T>& plan, at::TensorList arrays, int first, const Place&
   const int32* size = arrays[first].const_data_ptr<int32>();
   plan.stencil_blocks = size[stencil_blocks];
   plan.stencil_numbers = size[stencil_number_rows];
+  for (int kind = 0; kind < int(KindNumber::count); ++kind) {
+    with_kind(kind, [&](auto type) {
+      if (memory_of<decltype(type)> > 0 && size[stencil_size_count + kind] > 0)
+        plan.remembers = true;
+    });
+  }
   int at = first;
   using real = T;
 #define X(name, type, width, rows, meaning)                                                     \
@@ -181,11 +187,6 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
                     "all, got ",
                     plan.patches, " patches with up to ", plan.most_slots, " of ", plan.slots,
                     " slots; compile the scene again");
-  TORCH_CHECK_VALUE((plan.members == 1 || plan.members == 2 || plan.members == 4) &&
-                        plan.blocks % plan.members == 0,
-                    "plan.sizes must have groups of 1, 2 or 4 tetrahedra, and whole groups of "
-                    "blocks, got ",
-                    plan.members, " and ", plan.blocks, " blocks; compile the scene again");
   PlanRows count{};
   count.size = plan_size_count;
   count.vertex = plan.vertices;
@@ -204,6 +205,11 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.name = arrays[at++].const_data_ptr<type>();
 #include "views/cpu_plan.def"
 #undef X
+  TORCH_CHECK_VALUE((plan.members == 1 || plan.members == 2 || plan.members == 4) &&
+                        plan.blocks % plan.members == 0,
+                    "plan.sizes must have groups of 1, 2 or 4 tetrahedra, and whole groups of "
+                    "blocks, got ",
+                    plan.members, " and ", plan.blocks, " blocks; compile the scene again");
   if (stencils) view_stencils(plan, arrays, plan_arrays, place);
   if (levels)
     plan.levels = levels_view<T>(arrays, levels_at, plan.vertices,
@@ -412,12 +418,16 @@ inline Tensor stiffness_of(at::TensorList material, std::int64_t tets) {
   return stiffness.contiguous();
 }
 
-inline void check_effect(at::TensorList material, std::string_view name, const char* kind,
-                         std::int64_t count) {
+// Arrays of tetrahedra may be absent: zeros.
+inline void check_effect(at::TensorList material, std::string_view name, int width, bool of_tets,
+                         const char* kind, std::int64_t count) {
   const Tensor& array = material[place_in_material(name)];
-  TORCH_CHECK_VALUE(array.dim() >= 1 && array.size(-1) == count, "material.", name,
-                    " must have a row for each of the ", count, " stencils of kind ", kind,
-                    " in the plan, got ", describe(array));
+  const int rows = width > 1 ? -2 : -1;
+  TORCH_CHECK_VALUE(
+      array.dim() >= -rows && (array.size(rows) == count || (of_tets && array.numel() == 0)),
+      "material.", name, " must have a row for each of the ", count,
+      of_tets ? " tetrahedra" : " stencils", of_tets ? ", which stencils" : "", " of kind ", kind,
+      of_tets ? " read, got " : " in the plan, got ", describe(array));
 }
 
 // Columns, where an array has any, are all of its numbers.
@@ -441,15 +451,39 @@ inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
   return t.size(width > 1 ? -2 : -1);
 }
 
+// Whether some stencils of a plan read an array of the material.
+inline bool stencils_read(at::TensorList plan, std::string_view name) {
+  const int others = int(plan.size()) - plan_arrays;
+  if (others != stencil_arrays && others != stencil_arrays + level_arrays) return false;
+  const Tensor& sizes = plan[plan_arrays];
+  constexpr int count = stencil_size_count + int(KindNumber::count);
+  if (!sizes.is_cpu() || sizes.numel() != count) return false;
+  const int32* const size = sizes.const_data_ptr<int32>() + stencil_size_count;
+  bool read = false;
+#define KIND(kind, type, what)
+#define PARAMETER(kind, array) read = read || (name == #array && size[int(KindNumber::kind)] > 0);
+#include "elements/kinds.def"
+#undef KIND
+  return read;
+}
+
 // Every stencil needs its row of each array that its kind reads. `counts`: stencils of each kind; null without any.
-inline void check_effects(const int32* counts, at::TensorList material) {
+inline void check_effects(const int32* counts, std::int64_t tets, at::TensorList material) {
   if (!counts) return;
   TORCH_CHECK_VALUE(material.size() == all_material_arrays, "material must be ",
                     all_material_arrays, " arrays for a plan with stencils, got ", material.size());
 #define KIND(kind, type, what)
-#define PARAMETER(kind, array) check_effect(material, #array, #kind, counts[int(KindNumber::kind)]);
+#define PARAMETER(kind, array)                                                         \
+  if (const auto count = counts[int(KindNumber::kind)])                                \
+    check_effect(material, #array, array##_numbers, is_of_tets(effect_##array), #kind, \
+                 is_of_tets(effect_##array) ? tets : count);
 #include "elements/kinds.def"
 #undef KIND
+}
+
+// Whether a material has stiffness-proportional damping.
+inline bool has_damping(at::TensorList material) {
+  return material.size() > material_arrays && array_of(material, "stiffness_damping").size(-1) > 0;
 }
 
 // Whether a material has Poisson's ratio.
@@ -470,7 +504,7 @@ template <class T>
 Effects<T> effects_view(const int32* counts, std::int64_t tets, at::TensorList arrays,
                         std::int64_t batch, const Place& place) {
   Effects<T> effects;
-  check_effects(counts, arrays);
+  check_effects(counts, tets, arrays);
   if (arrays.size() == material_arrays) return effects;
   check_poisson(arrays, tets);
   int at = material_arrays;
@@ -496,7 +530,7 @@ struct EffectArrays {
       for (const Tensor& array : material) kept.push_back(array.contiguous());
       view = effects_view<T>(counts, tets, kept, batch, place);
     } else {
-      check_effects(counts, material);
+      check_effects(counts, tets, material);
     }
   }
 };

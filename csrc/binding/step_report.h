@@ -20,11 +20,11 @@ void report_typed(const StepTensors& t, const Numbers& n) {
   const Tensor u = t.out_velocities.mul(n.time_step);
   const auto field = [&](Field kind) {
     const Tensor out = at::empty_like(x);
-    field_typed<Backend, T>(kind, x, {}, t.material, t.plan, out, u);
+    field_typed<Backend, T>(kind, x, {}, t.material, t.plan, out, u, {}, {n.time_step});
     return out;
   };
   const Tensor gradient = field(Field::gradient), elements = field(Field::report);
-  const Tensor elastic = diagonal_typed<Backend, T>(t.material, t.plan, n.weighted);
+  const Tensor elastic = diagonal_typed<Backend, T>(t.material, t.plan, n.weighted, n.time_step);
   const Tensor sums = at::empty({call.batch, call.chunks(), report_sums}, t.info.options());
   call.elastic = {elastic.const_data_ptr<T>(),
                   elastic.dim() == 2 && elastic.size(0) == call.batch ? call.plan.vertices : 0};

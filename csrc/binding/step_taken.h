@@ -15,6 +15,11 @@ struct AdjointTensors {
   at::TensorList material, plan;
 };
 
+// The start of a step with damping.
+inline OptionalTensor start_of(const AdjointTensors& t) {
+  return has_damping(t.material) ? OptionalTensor(t.positions) : OptionalTensor();
+}
+
 // A call's view of a solved step, and the tensors that it points into.
 template <class Backend, class T>
 class SolvedStep {
@@ -29,7 +34,7 @@ class SolvedStep {
     check_vertices(t.after, call.plan.vertices);
     call.material = material_view<T>(call.plan, t.material, call.batch, place);
     const Material<T>& m = call.material;
-    const Tensor elastic = diagonal_typed<Backend, T>(t.material, t.plan, true);
+    const Tensor elastic = diagonal_typed<Backend, T>(t.material, t.plan, true, time_step);
     const bool own = elastic.dim() == 2 && elastic.size(0) == call.batch;
     call.elastic = {keep(elastic), own ? call.plan.vertices : 0};
     touching = m.planes_count + m.spheres_count > 0;
@@ -41,8 +46,10 @@ class SolvedStep {
     call.positions = keep(t.positions);
     call.velocities = keep(t.velocities);
     if (t.forces) call.forces = keep(*t.forces);
-    call.elastic_gradient =
-        keep(run_field<Backend>(Field::gradient, t.after.contiguous(), {}, t.material, t.plan));
+    const StepOfField step =
+        has_damping(t.material) ? StepOfField{time_step, t.positions} : StepOfField{};
+    call.elastic_gradient = keep(
+        run_field<Backend>(Field::gradient, t.after.contiguous(), {}, t.material, t.plan, step));
   }
   SolvedStep(const SolvedStep&) = delete;
 

@@ -1,12 +1,17 @@
 // All kinds of stencils, and loops over them, from the table in elements/kinds.def.
 #pragma once
+#include "elements/cloth_limit.h"
+#include "elements/damper.h"
 #include "elements/fibre.h"
 #include "elements/hinge.h"
+#include "elements/solid_limit.h"
 #include "elements/spring.h"
 #include "elements/thread.h"
 #include "elements/tie.h"
 #include "elements/triangle.h"
+#include "elements/volume.h"
 
+#include <string_view>
 #include <type_traits>
 
 namespace pd::inline PD_TARGET {
@@ -54,40 +59,97 @@ PD_HD void with_kind(int number, const Visit& visit) {
   }
 }
 
-// The arrays of the material that a kind reads, in the order of its `parameters`.
-template <class Kind>
-struct EffectsOf {
-  int effect[Kind::rows];  // EffectNumber
+// Whether an array has a row for every tetrahedron, by its number.
+constexpr bool is_of_tets(int effect) {
+  if (effect == effect_stiffness) return true;
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning) \
+  if (effect == effect_##name) return std::string_view(#rows) == "tet";
+#include "views/material.def"
+#undef X
+  return false;
+}
 
-  constexpr EffectsOf() : effect{} {
-    int at = 0;
+template <class Kind>
+constexpr int array_count = 0
 #define KIND(name, type, what)
-#define PARAMETER(kind, array) \
-  if constexpr (std::is_same_v<Kind, TypeOf<KindNumber::kind>>) effect[at++] = effect_##array;
+#define PARAMETER(kind, array) +int(std::is_same_v<Kind, TypeOf<KindNumber::kind>>)
 #include "elements/kinds.def"
 #undef KIND
+    ;
+
+// The arrays of the material that a kind reads, in the order of its `parameters`, and which numbers of a row each has.
+template <class Kind>
+struct ArraysOf {
+  static constexpr int count = array_count<Kind>;
+  int effect[count];     // EffectNumber
+  int first[count + 1];  // of the numbers, and their end
+  bool of_tets = false;
+
+  constexpr ArraysOf() : effect{}, first{} {
+    int at = 0;
+#define KIND(name, type, what)
+#define PARAMETER(kind, array)                                    \
+  if constexpr (std::is_same_v<Kind, TypeOf<KindNumber::kind>>) { \
+    effect[at] = effect_##array;                                  \
+    first[at + 1] = first[at] + array##_numbers;                  \
+    ++at;                                                         \
+  }
+#include "elements/kinds.def"
+#undef KIND
+    of_tets = is_of_tets(effect[0]);
+  }
+  PD_HD constexpr int width(int array) const { return first[array + 1] - first[array]; }
+  // all arrays have the same rows, and as many numbers as the kind reads
+  constexpr bool fit() const {
+    for (int i = 0; i < count; ++i) {
+      if (is_of_tets(effect[i]) != of_tets) return false;
+    }
+    return first[count] == Kind::rows;
   }
 };
+#define KIND(name, type, what) static_assert(ArraysOf<type>().fit());
+#include "elements/kinds.def"
+#undef KIND
 
-// The rows of those arrays in one environment.
+// Whether the rows of a kind are those of its tetrahedra.
+template <class Kind>
+constexpr bool reads_tets = ArraysOf<Kind>().of_tets;
+
+// Whether a GPU has kernels for a kind: none that depends on the start of a step or reads arrays of tetrahedra, yet.
+template <class Kind>
+constexpr bool runs_on_gpu = memory_of<Kind> == 0 && !reads_tets<Kind> &&
+                             ArraysOf<Kind>().first[array_count<Kind>] == array_count<Kind>;
+
+// The rows of those arrays in one environment. An array of tetrahedra that the scene lacks has zeros.
 template <class Kind, class T>
 struct MaterialRows {
-  const T* row[Kind::rows];
+  const T* row[array_count<Kind>];
 
   PD_HD MaterialRows(const Effects<T>& effects, std::int64_t environment) {
     int at = 0;
 #define KIND(name, type, what)
 #define PARAMETER(kind, array)                                  \
   if constexpr (std::is_same_v<Kind, TypeOf<KindNumber::kind>>) \
-    row[at++] = effects.array.of(environment);
+    row[at++] = effects.array.data ? effects.array.of(environment) : nullptr;
 #include "elements/kinds.def"
 #undef KIND
   }
 
-  // numbers of a step of one stencil, whose rows have this number
+  // the numbers of a row
+  PD_HD void values(std::int64_t number, T (&value)[Kind::rows]) const {
+    constexpr ArraysOf<Kind> arrays;
+    for (int a = 0; a < arrays.count; ++a) {
+      const int width = arrays.width(a);
+      for (int i = 0; i < width; ++i)
+        value[arrays.first[a] + i] = row[a] ? row[a][number * width + i] : T(0);
+    }
+  }
+
+  // numbers of a step of one stencil, whose rows have this number; without its memory
   PD_HD void read(std::int64_t number, T measure, T (&p)[Kind::numbers]) const {
-    T value[Kind::rows];
-    for (int i = 0; i < Kind::rows; ++i) value[i] = row[i][number];
+    T value[Kind::rows] = {};
+    values(number, value);
     Kind::parameters(value, measure, p);
   }
 };

@@ -11,7 +11,16 @@
 //   parameters(row, V, p)        numbers p of a step from the rows of the material; energies are scaled by V
 //   stress<Energy>(f, p, c, P, energy)         V P, and adds V psi to `energy`; c: constants
 //   weight(p, l, n)              V (2 mu l + n k); with l = n = 1 the stiffness at rest, for preconditioners
-// Second derivatives and derivatives by the material follow from `stress` with dual numbers.
+//   rest_weight(p)               that stiffness where it is another one
+// Second derivatives and derivatives by the material follow from `stress` with dual numbers. A kind whose stress has no
+// derivative in dual numbers has its own
+//   hessian(f, df, p, c, dp)     dP along dF
+// A kind may depend on the start of the step:
+//   memory                       how many of the numbers p, the last ones, `begin` makes
+//   begin(f, m)                  them, from F at the start
+//   memory_slope(f, df, p, c, s) derivative of V P : dF by them
+//   begin_slope(f, s, P)         s times the derivative of m by F at the start
+//   dissipates                   true: psi is an energy times time, which a step divides by h; no elastic energy
 #pragma once
 #include "math/dual.h"
 #include "math/vec.h"
@@ -29,6 +38,28 @@ constexpr int stored_numbers = gradient_numbers<Kind> + Kind::constants;
 // an array may not be empty
 template <class Kind>
 constexpr int constant_slots = Kind::constants > 0 ? Kind::constants : 1;
+
+template <class Kind>
+constexpr int memory_of = 0;
+template <class Kind>
+  requires requires { Kind::memory; }
+constexpr int memory_of<Kind> = Kind::memory;
+template <class Kind>
+constexpr bool dissipates = false;
+template <class Kind>
+  requires requires { Kind::dissipates; }
+constexpr bool dissipates<Kind> = Kind::dissipates;
+
+// The stiffness at rest, which preconditioners are made of.
+template <class Kind, class R>
+PD_HD R rest_weight(const R (&p)[Kind::numbers]) {
+  const R one(scalar_of<R>(1));
+  if constexpr (requires { Kind::rest_weight(p); }) {
+    return Kind::rest_weight(p);
+  } else {
+    return Kind::weight(p, one, one);
+  }
+}
 
 // F, column by column
 template <class Kind, class R, class Stored>
@@ -79,6 +110,7 @@ template <class Kind, class R>
 PD_HD void stress_differential(const Vec3<R> (&f)[Kind::dims], const Vec3<R> (&df)[Kind::dims],
                                const R (&p)[Kind::numbers], const R (&c)[constant_slots<Kind>],
                                Vec3<R> (&dp)[Kind::dims]) {
+  if constexpr (requires { Kind::hessian(f, df, p, c, dp); }) return Kind::hessian(f, df, p, c, dp);
   using D = Dual<R>;
   const R none(scalar_of<R>(0));
   Vec3<D> at[Kind::dims], stress[Kind::dims];
@@ -92,20 +124,22 @@ PD_HD void stress_differential(const Vec3<R> (&f)[Kind::dims], const Vec3<R> (&d
     dp[j] = {stress[j].x.slope, stress[j].y.slope, stress[j].z.slope};
 }
 
-// Derivatives by one row of the material, `which`: of the energy, and of P : df
+// Derivatives by one number of the rows, `which`: of the energy, and of P : df. `memory` is null where a kind has none.
 template <class Kind, class R>
 struct RowDerivative {
   R energy, product;
 
   PD_HD RowDerivative(int which, const R (&row)[Kind::rows], const R& measure,
                       const Vec3<R> (&f)[Kind::dims], const Vec3<R> (&df)[Kind::dims],
-                      const R (&c)[constant_slots<Kind>]) {
+                      const R (&c)[constant_slots<Kind>], const R* memory = nullptr) {
     using D = Dual<R>;
     const R none(scalar_of<R>(0)), one(scalar_of<R>(1));
     D rows[Kind::rows], numbers[Kind::numbers], constants[constant_slots<Kind>], sum(none, none);
     for (int i = 0; i < Kind::rows; ++i) rows[i] = D(row[i], i == which ? one : none);
     for (int i = 0; i < constant_slots<Kind>; ++i) constants[i] = D(c[i], none);
     Kind::parameters(rows, D(measure, none), numbers);
+    for (int i = 0; i < memory_of<Kind>; ++i)
+      numbers[Kind::numbers - memory_of<Kind> + i] = D(memory[i], none);
     Vec3<D> at[Kind::dims], stress[Kind::dims];
     for (int j = 0; j < Kind::dims; ++j)
       at[j] = {D(f[j].x, none), D(f[j].y, none), D(f[j].z, none)};
@@ -153,6 +187,72 @@ struct StencilGradient {
   }
 };
 
+// Work on the stencils alone that dissipate.
+template <class Element>
+struct Dissipating {
+  Element element;
+
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    if constexpr (dissipates<Kind>) element.template run<Kind>(stencils);
+  }
+};
+
+// Replaces the memory by the slope by it of gradient times field 1.
+struct StencilMemorySlope {
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    if constexpr (memory_of<Kind> > 0) {
+      using R = typename Stencils::R;
+      const StencilNumbers<Kind, Stencils> s(stencils);
+      Vec3<R> x[Kind::corners], f[Kind::dims], df[Kind::dims];
+      R slope[memory_of<Kind>];
+      stencils.corners(0, x);
+      deform<Kind>(x, s.g, f);
+      stencils.corners(1, x);
+      deform<Kind>(x, s.g, df);
+      Kind::memory_slope(f, df, s.p, s.c, slope);
+      stencils.remember(slope);
+    }
+  }
+};
+
+// That slope by the positions at the start of the step, which are field 0.
+struct StencilStartSlope {
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    if constexpr (memory_of<Kind> > 0) {
+      using R = typename Stencils::R;
+      const StencilNumbers<Kind, Stencils> s(stencils);
+      Vec3<R> x[Kind::corners], f[Kind::dims], p[Kind::dims];
+      R slope[memory_of<Kind>];
+      for (int i = 0; i < memory_of<Kind>; ++i) slope[i] = s.p[Kind::numbers - memory_of<Kind> + i];
+      stencils.corners(0, x);
+      deform<Kind>(x, s.g, f);
+      Kind::begin_slope(f, slope, p);
+      stencil_forces<Kind>(p, s.g, x);
+      stencils.add(x);
+    }
+  }
+};
+
+// Makes the memory, from the positions at the start of the step, which are field 0.
+struct StencilBegin {
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    if constexpr (memory_of<Kind> > 0) {
+      using R = typename Stencils::R;
+      const StencilNumbers<Kind, Stencils> s(stencils);
+      Vec3<R> x[Kind::corners], f[Kind::dims];
+      R memory[memory_of<Kind>];
+      stencils.corners(0, x);
+      deform<Kind>(x, s.g, f);
+      Kind::begin(f, memory);
+      stencils.remember(memory);
+    }
+  }
+};
+
 // No work on stencils.
 struct NoStencils {
   template <class Kind, class Stencils>
@@ -187,7 +287,7 @@ struct StencilDiagonal {
     const StencilNumbers<Kind, Stencils> s(stencils);
     const R none(scalar_of<R>(0)), one(scalar_of<R>(1)), corners{scalar_of<R>(Kind::corners)};
     const R weight =
-        bounded ? Kind::weight(s.p, stencils.bound(), corners) : Kind::weight(s.p, one, one);
+        bounded ? Kind::weight(s.p, stencils.bound(), corners) : rest_weight<Kind>(s.p);
     R square[Kind::corners];
     gradient_squares<Kind>(s.g, square);
     Vec3<R> d[Kind::corners];

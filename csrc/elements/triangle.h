@@ -29,6 +29,32 @@ PD_HD Vec3<R> some_normal(const Vec3<R>& a) {
           select(none < square, scale * n.z, none)};
 }
 
+// The two orthonormal columns nearest to a and b.
+template <class R>
+struct NearestFrame {
+  Vec3<R> first, second;
+
+  PD_HD NearestFrame(const Vec3<R>& a, const Vec3<R>& b) {
+    using T = scalar_of<R>;
+    const R none(T(0)), one(T(1));
+    const Vec3<R> c = cross(a, b);
+    const R a2 = dot(a, a), b2 = dot(b, b), area2 = dot(c, c), area = square_root(area2);
+    const auto good = (a2 + b2) * R(epsilon<T>()) < area;
+    const R per_area = one / select(good, area, one);
+    const auto longer = b2 <= a2;
+    const Vec3<R> instead = some_normal(
+        Vec3<R>{select(longer, a.x, b.x), select(longer, a.y, b.y), select(longer, a.z, b.z)});
+    const Vec3<R> n = {select(good, per_area * c.x, instead.x),
+                       select(good, per_area * c.y, instead.y),
+                       select(good, per_area * c.z, instead.z)};
+    const Vec3<R> r0 = a + cross(b, n), r1 = b - cross(a, n);
+    const R h2 = dot(r0, r0);  // |r0| = |r1| = h
+    const R per_h = one / square_root(select(none < h2, h2, one));
+    first = per_h * r0;
+    second = per_h * r1;
+  }
+};
+
 struct Triangle {
   static constexpr int corners = 3, dims = 2, constants = 0, rows = 3;
   static constexpr int numbers = 2;  // 2 mu V, lambda V
@@ -45,24 +71,11 @@ struct Triangle {
   PD_HD static void stress(const Vec3<R> (&f)[2], const R (&p)[2], const R (&)[1],
                            Vec3<R> (&stress)[2], R& energy) {
     using T = scalar_of<R>;
-    const R none(T(0)), one(T(1)), two(T(2)), half(T(0.5));
+    const R none(T(0)), one(T(1)), half(T(0.5));
     const Vec3<R>&a = f[0], &b = f[1];
-    const Vec3<R> c = cross(a, b);
-    const R a2 = dot(a, a), b2 = dot(b, b), area2 = dot(c, c), area = square_root(area2);
-    const auto good = (a2 + b2) * R(epsilon<T>()) < area;
-    const R per_area = one / select(good, area, one);
-    const auto longer = b2 <= a2;
-    const Vec3<R> instead = some_normal(
-        Vec3<R>{select(longer, a.x, b.x), select(longer, a.y, b.y), select(longer, a.z, b.z)});
-    const Vec3<R> n = {select(good, per_area * c.x, instead.x),
-                       select(good, per_area * c.y, instead.y),
-                       select(good, per_area * c.z, instead.z)};
-    const Vec3<R> r0 = a + cross(b, n), r1 = b - cross(a, n);
-    const R h2 = dot(r0, r0);  // |r0| = |r1| = h
-    const R per_h = one / square_root(select(none < h2, h2, one));
-    const Vec3<R> frame0 = per_h * r0, frame1 = per_h * r1;
-    const Vec3<R> d0 = a - frame0, d1 = b - frame1;
-    const R trace = dot(frame0, d0) + dot(frame1, d1);
+    const NearestFrame<R> frame(a, b);
+    const Vec3<R> d0 = a - frame.first, d1 = b - frame.second;
+    const R trace = dot(frame.first, d0) + dot(frame.second, d1);
     const R most = p[0], linear = p[1] * trace;
     const auto capped = most < linear;
     const R tension = select(capped, most, linear);

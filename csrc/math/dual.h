@@ -54,4 +54,18 @@ struct Dual {
   }
 };
 
+// Numbers that do not vary where others do: their values, and back as dual numbers without slopes.
+template <class R>
+struct Still {
+  using Value = R;
+  PD_HD static const R& value(const R& a) { return a; }
+  PD_HD static const R& number(const R& a) { return a; }
+};
+template <class R>
+struct Still<Dual<R>> {
+  using Value = R;
+  PD_HD static const R& value(const Dual<R>& a) { return a.value; }
+  PD_HD static Dual<R> number(const R& a) { return {a, R(scalar_of<R>(0))}; }
+};
+
 }  // namespace pd::inline PD_TARGET

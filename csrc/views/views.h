@@ -92,6 +92,7 @@ struct Plan {
   int members = 1;     // tetrahedra of a group that averages its trace: 1, 2 or 4
   int stencil_blocks = 0,
       stencil_numbers = 0;  // blocks of 16 stencils; rows of 16 numbers of a step
+  bool remembers = false;   // some stencils have numbers of the start of a step
   Levels<T> levels;
 };
 
@@ -175,9 +176,11 @@ struct Values {
   PD_HD const T* of(std::int64_t environment) const { return data + environment * stride; }
 };
 
-// The arrays that only some scenes have; data is null where a scene lacks them.
+// The arrays that stencils read: the stiffness of tetrahedra, and those that only some scenes have. Data is null where
+// a scene lacks them.
 template <class T>
 struct Effects {
+  Values<T> stiffness;
 #define X(name, width, rows, meaning)
 #define EFFECT(name, width, rows, meaning) Values<T> name;
 #include "views/material.def"
@@ -185,6 +188,7 @@ struct Effects {
 };
 
 enum EffectNumber : int {
+  effect_stiffness,
 #define X(name, width, rows, meaning)
 #define EFFECT(name, width, rows, meaning) effect_##name,
 #include "views/material.def"
@@ -282,11 +286,16 @@ enum class Field : int {
   element_energy,
   element_energy_product,
   diagonal,
-  report,            // see SolidReport
-  effect_energy,     // elastic energy of all elements
-  lame_product,      // derivatives by E and nu, of gradient times direction or else of the energy
-  effect_products,   // derivatives by the arrays of the effects
-  stiffness_at_rest  // of every element, as preconditioners take it
+  report,             // see SolidReport
+  effect_energy,      // elastic energy of all elements
+  lame_product,       // derivatives by E and nu, of gradient times direction or else of the energy
+  effect_products,    // derivatives by the arrays of the effects
+  stiffness_at_rest,  // of every element, as preconditioners take it
+  // the same of the energies that a step dissipates, with per_time: see dissipates in elements/stencil.h
+  damping_gradient,
+  damping_product,  // Hessian times direction
+  damping_start,  // derivative of gradient times direction by the positions at the start of the step
+  damping_products
 };
 
 template <class T, class P = Plan<T>>
@@ -297,13 +306,14 @@ struct FieldCall : P::EffectViews {
   Values<T> stiffness;
   std::int64_t batch = 0;
   bool weighted = false;         // weighted by l_e; for the diagonal
+  T per_time = 0;                // 1 / h, or 0 without a step: `positions` are those at its start
   const T* positions = nullptr;  // [batch, vertices, 3], for all but the diagonal
   const T* displacement =
       nullptr;  // [batch, vertices, 3] added to the positions without rounding the sum; may be null
   const T* direction = nullptr;  // [batch, vertices, 3], for the products
   T* out =
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, tets, 2] of lame_product,
-               // [batch, vertices] of the diagonal
+                // [batch, vertices] of the diagonal
   // stiffness_at_rest: [batch, elements], tetrahedra and then stencils kind by kind
 };
 
@@ -440,7 +450,9 @@ struct ConjugateCall : P::EffectViews {
   Values<T> stiffness;
   Values<T> inertia, inverse;  // [vertices]; inverse diagonal, 0 where a vertex does not move
   std::int64_t batch = 0;
+  T per_time = 0;                // 1 / h, or 0 without dissipation
   const T* positions = nullptr;  // [batch, vertices, 3]
+  const T* start = nullptr;      // the same at the start of the step, with per_time
   const T* projector = nullptr;  // [batch, vertices, 3, 3] on the free directions; may be null
   const T* sliding =
       nullptr;  // [batch, vertices, slide_count, 3], slide_across being part of H; may be null

@@ -161,7 +161,9 @@ def test_fibres_have_unit_length_at_rest_and_contract() -> None:
 
 
 def test_groups_come_by_kind_in_the_order_of_the_table() -> None:
-    body, sheet, rod = solid(), cloth(warp=3.0, grain=(1, 0, 0)), straight()
+    options = {"strain_limit": (0.9, 1.1)}
+    body = solid(poisson=0.3, law="volume", stiffness_damping=0.1, **options)
+    sheet, rod = cloth(warp=3.0, grain=(1, 0, 0), **options), straight()
     parts = (
         pd.Fibres(body, (1, 0, 0), 1e4), rod, pd.Tie(rod, [4], body, [[0.2, 0.2, 0.0]], stiffness=1.0), sheet, body,
         pd.Springs(sheet, [[0, 1]], 2.0),
@@ -175,8 +177,9 @@ def test_groups_come_by_kind_in_the_order_of_the_table() -> None:
         assert group.corners.dtype == np.int64
         assert group.gradients.shape == (count, kind.corners, kind.columns)
         assert (group.measure.shape, group.constants.shape) == ((count,), (count, kind.constants))
-        assert tuple(group.material) == kind.rows
-        assert {row.shape for row in group.material.values()} == {(count,)}
+        assert tuple(group.material) == kind.own_rows
+        assert {row.shape for row in group.material.values()} <= {(count,), (count, 3)}
+        assert (group.tets is not None) == kind.of_tets
         largest = np.abs(group.gradients).max(axis=(1, 2))
         assert (np.abs(group.gradients.sum(axis=1)).max(axis=1) <= EXACT * largest).all()
         assert (group.measure > 0.0).all()
@@ -186,7 +189,8 @@ def test_groups_come_by_kind_in_the_order_of_the_table() -> None:
                 (own,) = (one for one in part.stencils(lambda b: scene.vertex_range(b).start) if one.kind == group.kind)
                 np.testing.assert_array_equal(group.corners[rows], own.corners)
     assert scene.stencil_ranges(parts[-1]) == {"spring": slice(4, 5)}
-    assert scene.stencil_ranges(body) == {}
+    count = len(body.mesh.tets)
+    assert scene.stencil_ranges(body) == {kind: slice(0, count) for kind in ("solid_limit", "volume", "damper")}
     with pytest.raises(ValueError, match="part must be a part of the scene, got another one"):
         scene.stencil_ranges(straight())
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..common.checks import check_has_values
-from ..ops.diagonal import step_diagonal
+from ..ops.diagonal import has_damping, step_diagonal
 from ..scene.solvers import Chebyshev, Jacobi
 from ..simulation.state import State
 
@@ -49,6 +49,9 @@ def _power(sim: Stepper, state: State, iterations: int) -> float:
         vector = torch.where(free, vector, torch.zeros_like(vector))
         vector = vector / vector.norm()
         product = inertia * vector + _ops.hessian_product(state[0], vector, material, plan)
+        if has_damping(material):
+            damping, *_ = _ops.damping_vjp(state[0], state[0], vector, material, plan, time_step=sim.time_step)
+            product = product + damping
         vector = vector - settings["relaxation"] * product / diagonal
         scale = vector.norm()
     return float(scale)

@@ -60,6 +60,17 @@ class Kind(NamedTuple):
     constants: int  # further constants of a stencil
     rows: tuple[str, ...]  # names of its arrays in the material
     meaning: str
+    on_gpu: bool  # whether a GPU has kernels for it
+
+    @property
+    def of_tets(self) -> bool:
+        """Whether these arrays have a row for every tetrahedron, so that the kind has none of its own."""
+        return any(row.name == self.rows[0] and row.rows == "tet" for row in MATERIAL_TABLE)
+
+    @property
+    def own_rows(self) -> tuple[str, ...]:
+        """Names of the arrays that have a row for each of its stencils."""
+        return () if self.of_tets else self.rows
 
 
 class SettingRow(NamedTuple):

@@ -38,6 +38,13 @@ _FOLDED = "part of the vertex weights: no cost per iteration"
 # cost of stencils
 _LOCAL = "a local step each per iteration"
 
+# kinds of stencils of solids
+_OF_SOLIDS = {
+    "solid_limit": "strain limits",
+    "volume": 'law "volume"',
+    "damper": "stiffness-proportional damping",
+}
+
 _ANY_BATCH = 2**31 - 1
 _TURNING_MODES = 24  # of the coarse problem of Multilevel("corotated"), see csrc/solver/multilevel/deflation.h
 
@@ -126,14 +133,24 @@ def _body_lines(scene: Scene) -> list[str]:
     if scene.solids:
         tets = sum(len(solid.mesh.tets) for solid in scene.solids)
         lines.append(f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step per iteration")
-    groups = [solid.averaging_groups for solid in scene.solids if not isinstance(solid.poisson, float)]
+    groups = [
+        solid.averaging_groups
+        for solid in scene.solids
+        if not isinstance(solid.poisson, float) and solid.law == "corotated"
+    ]
     if groups:
         most = max(int(np.bincount(numbers).max()) for numbers in groups)
         count = sum(int(numbers.max()) + 1 for numbers in groups)
         lines.append(f"Poisson's ratio: {count} groups of up to {most} tetrahedra share a volume strain")
+    for kind, name in _OF_SOLIDS.items():
+        own = (group for solid in scene.solids for group in solid.stencils(lambda body: 0))
+        count = sum(len(group) for group in own if group.kind == kind)
+        if count:
+            lines.append(f"{name}: {count} tetrahedra, {_LOCAL}")
     sheets = [body for body in scene.bodies if isinstance(body, Cloth)]
     if sheets:
-        sizes = _sizes_of(sheets, {"triangle": "triangles", "hinge": "hinges", "thread": "threads"})
+        words = {"triangle": "triangles", "hinge": "hinges", "thread": "threads", "cloth_limit": "strain limits"}
+        sizes = _sizes_of(sheets, words)
         lines.append(f"cloth: {len(sheets)} ({sizes}), {_LOCAL}")
     rods = [body for body in scene.bodies if isinstance(body, Rod)]
     if rods:

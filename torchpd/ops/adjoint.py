@@ -27,7 +27,7 @@ from torch import Tensor
 
 from .. import _C
 from ..common.warn import warn_user
-from .diagonal import named_material, pinned_vertices, step_diagonal
+from .diagonal import has_damping, named_material, pinned_vertices, step_diagonal
 
 __all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "adjoint_fallback", "is_recording", "step_gradient"]
 
@@ -67,13 +67,17 @@ def _inertial(material: dict[str, Tensor], time_step: float) -> Tensor:
 def step_gradient(call: AdjointCall) -> Tensor:
     """Gradient of the step objective at `call.after` [B, V, 3] N, without contacts; zero at hard pins.
 
-    m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + springs + elastic gradient.
+    m / h^2 (1 + damping h) (x' - x) - m (v / h + gravity) - forces + springs + elastic gradient + that of
+    stiffness-proportional damping.
     """
     material = named_material(call.material)
     masses, gravity = material["masses"].unsqueeze(-1), material["gravity"].unsqueeze(-2)
     pull = masses * (call.velocities / call.time_step + gravity)
     gradient = _inertial(material, call.time_step) * (call.after - call.positions) - pull
     gradient = gradient + torch.ops.torchpd.gradient(call.after, call.material, call.plan)
+    if has_damping(call.material):
+        damping = torch.ops.torchpd.damping_gradient
+        gradient = gradient + damping(call.after, call.positions, call.material, call.plan, time_step=call.time_step)
     pins = pinned_vertices(call.plan)
     springs = material["pin_stiffness"].unsqueeze(-1)
     hard = torch.isinf(springs)
@@ -111,6 +115,7 @@ def adjoint_fallback(
     projector: Tensor | None,
     material: Sequence[Tensor],
     plan: Sequence[Tensor],
+    start: Tensor | None = None,
     *,
     time_step: float,
 ) -> Tensor:
@@ -129,6 +134,7 @@ def adjoint_fallback(
         projector: contact projector [B, V, 3, 3].
         material: of the step.
         plan: of the scene.
+        start: x [B, V, 3], in scenes with stiffness-proportional damping.
         time_step: h [s].
     """
     arrays, tolerance = list(plan), ADJOINT_TOLERANCE[right.dtype]
@@ -150,6 +156,9 @@ def adjoint_fallback(
         projector,
         list(material),
         arrays,
+        None,
+        start,
         tolerance=tolerance,
+        time_step=time_step,
     )
     return torch.where(failed[:, None, None], instead, solution)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..common.tables import MATERIAL_TABLE
 
-__all__ = ["elastic_material", "named_material", "pinned_vertices", "step_diagonal"]
+__all__ = ["elastic_material", "has_damping", "named_material", "pinned_vertices", "step_diagonal"]
 
 
 def named_material(arrays: Sequence[Tensor]) -> dict[str, Tensor]:
@@ -28,6 +28,12 @@ def elastic_material(material: Sequence[Tensor]) -> list[Tensor]:
     ]
 
 
+def has_damping(material: Sequence[Tensor]) -> bool:
+    """Whether a material has stiffness-proportional damping."""
+    damping = named_material(material).get("stiffness_damping")
+    return damping is not None and damping.shape[-1] > 0
+
+
 def pinned_vertices(plan: Sequence[Tensor]) -> Tensor:
     """Number of each pinned vertex in the user's order [P]."""
     _, vertex_order, pin_vertex, *_ = plan
@@ -40,11 +46,14 @@ def step_diagonal(
     """Inertia a and diagonal D of every vertex, [V] or [B, V], in N/m; inf at hard pins.
 
     a_i = m_i / h^2 (1 + damping h) + k_i;  D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted. With
-    Poisson's ratio 2 mu l_e + 4 lambda takes the place of l_e w_e, and 2 mu + lambda that of w_e.
+    Poisson's ratio 2 mu l_e + 4 lambda takes the place of l_e w_e, and 2 mu + lambda that of w_e. Other elements add
+    theirs, damping 2 mu beta / h l_e.
     """
     material = named_material(material_arrays)
     masses, springs = material["masses"], material["pin_stiffness"]
     held = masses.new_zeros((*springs.shape[:-1], masses.shape[-1]))
     held = held.index_copy(-1, pinned_vertices(plan), springs)
     inertia = masses / time_step**2 * (1 + material["damping"].unsqueeze(-1) * time_step) + held
-    return inertia, inertia + torch.ops.torchpd.elastic_diagonal(list(material_arrays), list(plan), weighted=weighted)
+    return inertia, inertia + torch.ops.torchpd.elastic_diagonal(
+        list(material_arrays), list(plan), weighted=weighted, time_step=time_step
+    )

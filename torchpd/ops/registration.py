@@ -148,22 +148,50 @@ def _(positions: Tensor, direction: Tensor | None, material: Sequence[Tensor], p
 
 @_register_fake("effect_products")
 def _(positions: Tensor, direction: Tensor | None, material: Sequence[Tensor], plan: Sequence[Tensor]) -> list[Tensor]:
-    return [positions.new_empty((len(positions), array.shape[-1])) for array in material[_CORE:]]
+    return _fake_products(positions, material)
+
+
+def _fake_products(positions: Tensor, material: Sequence[Tensor]) -> list[Tensor]:
+    """Derivatives by the arrays that only some scenes have, of every environment."""
+    rows = zip(EFFECT_ROWS, material[_CORE:], strict=False)
+    return [positions.new_empty((len(positions), *array.shape[array.dim() - row.dims :])) for row, array in rows]
+
+
+@_register_fake("damping_gradient")
+def _(positions: Tensor, *_: Any, time_step: float) -> Tensor:
+    return positions.new_empty(positions.shape)
+
+
+@_register_fake("damping_vjp")
+def _(
+    positions: Tensor, start: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor], **_: Any
+) -> list[Tensor]:
+    by_state = [positions.new_empty(positions.shape) for _ in range(2)]
+    by_stiffness = positions.new_empty((len(positions), material[_STIFFNESS].shape[-1]))
+    return [*by_state, by_stiffness, *_fake_products(positions, material)]
 
 
 @_register_fake("elastic_diagonal")
-def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, weighted: bool) -> Tensor:
+def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, weighted: bool, time_step: float = 0.0) -> Tensor:
     stiffness, (_, vertex_order, *_) = material[_STIFFNESS], plan
     own = [len(array) for row, array in _elastic_rows(material) if array.dim() > row.dims]
     return stiffness.new_empty((*own[:1], vertex_order.shape[0]))
 
 
 @_register_fake("stiffness_at_rest")
-def _(material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
+def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, time_step: float = 0.0) -> Tensor:
     named, stiffness = named_material(material), material[_STIFFNESS]
-    stencils = [named[kind.rows[0]].shape[-1] for kind in KINDS.values() if kind.rows[0] in named]
     own = [len(array) for row, array in _elastic_rows(material) if array.dim() > row.dims]
-    return stiffness.new_empty((*own[:1], stiffness.shape[-1] + sum(stencils)))
+    rows = {row.name: row for row in MATERIAL_TABLE}
+    counts = [
+        named[name].shape[named[name].dim() - rows[name].dims]
+        for name, *_ in (kind.own_rows for kind in KINDS.values() if kind.own_rows)
+        if name in named
+    ]
+    # the material does not tell which tetrahedra have stencils
+    some = any(named[name].shape[-1] > 0 for name in ("poisson", "stiffness_damping") if name in named)
+    count = torch.library.get_ctx().new_dynamic_size() if some else stiffness.shape[-1] + sum(counts)
+    return stiffness.new_empty((*own[:1], count))
 
 
 @_register_fake("precondition")
@@ -308,7 +336,8 @@ def _effect_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list
         w = _sum_to_stiffness(grad[:, None] * _by_stiffness(positions, None, material, ctx.plan), stiffness)
     if any(ctx.needs_input_grad[1][_CORE:]):
         products = _ops.effect_products(positions, None, material, ctx.plan)
-        effects = _sum_to_rows(material, [grad[:, None] * product for product in products])
+        each = [grad.view(-1, *[1] * (product.dim() - 1)) * product for product in products]
+        effects = _sum_to_rows(material, each)
     return x, _for_material(material, w, effects), _for_plan(ctx)
 
 
@@ -379,6 +408,19 @@ def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tens
     if any(ctx.needs_input_grad[1][_CORE:]):
         effects = _sum_to_rows(material, _ops.effect_products(positions, grad, material, ctx.plan))
     return x, _for_material(material, w, effects), _for_plan(ctx)
+
+
+def _save_damping(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+    positions, start, material, ctx.plan = inputs
+    ctx.time_step = keyword_only_inputs["time_step"]
+    ctx.save_for_backward(positions, start, *material)
+
+
+def _damping_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, list[Tensor | None], list[None]]:
+    positions, start, *material = ctx.saved_tensors
+    x, before, w, *effects = _ops.damping_vjp(positions, start, grad, material, ctx.plan, time_step=ctx.time_step)
+    stiffness = _sum_to_stiffness(w, material[_STIFFNESS])
+    return x, before, _for_material(material, stiffness, _sum_to_rows(material, effects)), _for_plan(ctx)
 
 
 def _element_energy_product_backward(
@@ -469,6 +511,7 @@ register_rule("rollout_vjp", rollout_vjp_rule)
 
 
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
+torch.library.register_autograd("torchpd::damping_gradient", _damping_backward, setup_context=_save_damping)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)
 
 for _name, _backward, _setup in (

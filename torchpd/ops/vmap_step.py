@@ -173,6 +173,7 @@ def _rotation_rule(name: str) -> Rule:
 
 for _name in ("gradient", "hessian_product", "effect_energy"):
     register_rule(_name, _batch_rule(_name, read=_ELASTIC))
+register_rule("damping_gradient", _batch_rule("damping_gradient", read=_ELASTIC))
 for _name in ("element_energy", "element_energy_product"):
     register_rule(_name, _batch_rule(_name, read=("stiffness",)))
 register_rule("step", _batch_rule("step"))

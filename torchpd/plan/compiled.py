@@ -10,7 +10,6 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ..common.tables import KINDS
 from ..ops.diagonal import named_material
 from ..scene.pins import PinnedComponents
 from ..scene.scene import Scene
@@ -74,7 +73,7 @@ class CompiledScene:
     @cached_property
     def has_stencils(self) -> bool:
         """Whether the scene has elements besides tetrahedra: cloth, springs, fibres, and the like."""
-        return any(kind.rows[0] in self.named and self.named[kind.rows[0]].numel() > 0 for kind in KINDS.values())
+        return any(row.name == "stencil_sizes" for row in self.plan.table)
 
     @property
     def environments(self) -> int:

@@ -201,10 +201,10 @@ def internal_numbers(vertex_order: NDArray[np.int32]) -> NDArray[np.int32]:
     return internal
 
 
-def stencil_arrays(values: SceneValues) -> list[tuple[int, Index, Reals, Reals, Reals]]:
-    """Stencils of a scene as C++ takes them: number of the kind, corners, g_a, measures, constants."""
+def stencil_arrays(values: SceneValues) -> list[tuple[int, Index, Reals, Reals, Reals, Index | None]]:
+    """Stencils of a scene as C++ takes them: number of the kind, corners, g_a, measures, constants, tetrahedra."""
     return [
-        (list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants)
+        (list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants, group.tets)
         for group in values.stencils
     ]
 

@@ -55,8 +55,9 @@ SCENE_NAME_HINTS = {
 _POSITIVE = ("stiffness", "masses", "membrane_youngs", "thickness")
 _NOT_NEGATIVE = (
     "bending", "rest_curvature", "spring_stiffness", "rest_length", "tie_stiffness", "fibre_stiffness", "fibre_length",
-    "thread_stiffness",
+    "thread_stiffness", "stiffness_damping",
 )  # fmt: skip
+_LIMITS = ("solid_limit", "cloth_limit")
 _UNIT_SLACK = 1e-4  # tolerance on the length of a plane normal: float32 rounding, and that of a training step
 
 
@@ -82,7 +83,8 @@ def material_of(values: SceneValues, dtype: torch.dtype) -> dict[str, Tensor]:
 
 def effect_rows(values: SceneValues) -> dict[str, NDArray[np.float64]]:
     """Arrays of a scene that only some scenes have, in the order of the table."""
-    found = {} if values.poisson is None else {"poisson": values.poisson}
+    of_tets = {"poisson": values.poisson, "stiffness_damping": values.stiffness_damping}
+    found = {name: row for name, row in of_tets.items() if row is not None}
     for group in values.stencils:
         found |= group.material
     return {row.name: found[row.name] for row in MATERIAL_TABLE if row.name in found}
@@ -122,8 +124,10 @@ def with_absent(arrays: list[Tensor], names: Iterable[str]) -> list[Tensor]:
     by_name = dict(zip(names, arrays, strict=True))
     if len(by_name) == len(CORE_ROWS):
         return arrays
-    unread = torch.empty(0, dtype=arrays[0].dtype, device=arrays[0].device)
-    return [by_name.get(row.name, unread) for row in MATERIAL_TABLE]
+    return [
+        by_name[row.name] if row.name in by_name else arrays[0].new_empty(0 if row.width == 1 else (0, row.width))
+        for row in MATERIAL_TABLE
+    ]
 
 
 def _require(good: Tensor, name: str, contract: str, tensor: Tensor) -> None:
@@ -152,6 +156,11 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
         _require((tensor > -1) & (tensor < 0.495), full, "in (-1, 0.495)", tensor)
     elif name == "damping":
         _require(tensor >= 0, full, ">= 0", tensor)
+    elif name in _LIMITS:
+        low, high, stiffness = tensor.unbind(-1)
+        _require((low >= 0) & (low <= 1), f"{full}: lo (column 0)", "in [0, 1]", low)
+        _require(high >= 1, f"{full}: hi (column 1)", "at least 1", high)
+        _require(stiffness >= 0, f"{full}: stiffness (column 2)", ">= 0", stiffness)
     elif name == "planes":
         lengths = tensor[..., PLANES["normal"]].norm(dim=-1)
         _require((lengths - 1).abs() <= _UNIT_SLACK, f"{full}: the normal (columns 0 to 2)", "of unit length", tensor)

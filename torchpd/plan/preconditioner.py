@@ -66,7 +66,7 @@ def reference_material(plan: Plan, material: Sequence[Tensor], time_step: float)
     exact for an environment whose values are all s times these.
     """
     arrays, material = without_preconditioner(plan).arrays, [array.detach() for array in material]
-    stiffness = torch.ops.torchpd.stiffness_at_rest(material, list(arrays))
+    stiffness = torch.ops.torchpd.stiffness_at_rest(material, list(arrays), time_step=time_step)
     inertia, _ = step_diagonal(arrays, material, time_step)
     stiffness = stiffness.amax(0) if stiffness.dim() == 2 else stiffness
     if inertia.dim() == 2:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -139,4 +139,18 @@ def groups_of(values: SceneValues, positions: Array, time_step: float) -> Iterat
         group = np.arange(len(values.tets)) if values.tet_group is None else values.tet_group
         yield ElementGroup(tetrahedra(values), group, positions, time_step)
     for stencils in values.stencils:
-        yield ElementGroup(stencils, np.arange(len(stencils)), positions, time_step)
+        yield ElementGroup(_with_rows(stencils, values), np.arange(len(stencils)), positions, time_step)
+
+
+def _with_rows(stencils: StencilGroup, values: SceneValues) -> StencilGroup:
+    """The group with rows of its own in place of those of its tetrahedra."""
+    if stencils.tets is None:
+        return stencils
+    youngs, nothing = values.stiffness, np.zeros(len(values.tets))
+    nu = nothing if values.poisson is None else values.poisson
+    seconds = nothing if values.stiffness_damping is None else values.stiffness_damping
+    rows = {
+        "volume": {"volume_stiffness": 3.0 * youngs * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))},
+        "damper": {"viscosity": youngs / (1.0 + nu) * seconds},
+    }[stencils.kind]
+    return replace(stencils, material={name: row[stencils.tets] for name, row in rows.items()})

@@ -47,6 +47,7 @@ def _solid(names: tuple[str, str]) -> Kind:
     def law(given: Given) -> Law:
         youngs, nu = (given.material[name] for name in names)
         bulk = youngs * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
+        bulk = np.where(given.group < 0, 0.0, bulk)  # a kind of its own has their volume energy
         return Corotated(youngs / (1.0 + nu), bulk, given.measure, given.group)
 
     def rows(given: Given, rates: Rows) -> Rows:

@@ -14,6 +14,7 @@ from ..common.synonyms import check_arguments
 from ..geometry.mesh_checks import warn
 from ..geometry.rest_triangles import Hinges, RestTriangles, find_hinges, rest_triangles
 from ..geometry.tri_mesh import TriMesh
+from .limits import limit_rows
 from .part import ArrayLike, Body, Place, per_item, report_size, set_fields, unit_vectors
 from .stencils import StencilGroup
 
@@ -55,6 +56,10 @@ class Cloth(Body):
             surface, for shells. Such a hinge may bend to either side.
         warp: further stiffness along the warp [N/m], a scalar or one value per triangle; or None.
         weft: the same across the warp, along the weft.
+        strain_limit: least and largest stretch (lo, hi), or one pair per triangle [F, 2], lo <= 1 <= hi; None: none.
+            Beyond them A k / 2 dist^2(F, {stretches in [lo, hi]}) adds to the energy. Fabrics hardly resist compression
+            in their plane: lo = 0 leaves it out.
+        limit_stiffness: k [N/m], a scalar or one value per triangle. None: 30 times youngs thickness.
         grain: direction of the warp: [2] in `rest_uv`, by default (0, 1), or else [3] in space, projected to triangles.
 
     Raises:
@@ -75,6 +80,8 @@ class Cloth(Body):
     warp: Array | None
     weft: Array | None
     grain: Array | None
+    strain_limit: Array | None  # [F, 2]
+    limit_stiffness: Array | None  # [F]
 
     @check_arguments("Cloth")
     def __init__(
@@ -91,6 +98,8 @@ class Cloth(Body):
         warp: ArrayLike | None = None,
         weft: ArrayLike | None = None,
         grain: Any = None,
+        strain_limit: Any = None,
+        limit_stiffness: ArrayLike | None = None,
     ) -> None:
         if not isinstance(surface, TriMesh):
             raise TypeError(
@@ -115,12 +124,16 @@ class Cloth(Body):
             warp=None if warp is None else per_triangle("warp", warp, "N/m"),
             weft=None if weft is None else per_triangle("weft", weft, "N/m"),
         )
+        within = self.youngs * self.thickness
+        limits = limit_rows("Cloth", strain_limit, limit_stiffness, within, of="triangle", unit="N/m")
         hinges = self._hinges  # refuses triangles without area and edges of more than two
         set_fields(
             self,
             bending=None if bending is None else _per_hinge("bending", bending, hinges, "N m"),
             rest_curvature=_curvature(rest_curvature, surface, hinges),
             grain=_grain(grain, uv, woven=warp is not None or weft is not None),
+            strain_limit=None if limits is None else limits[:, :2],
+            limit_stiffness=None if limits is None else limits[:, 2],
         )
         self._directions()  # refuses a direction along a normal
 
@@ -181,7 +194,14 @@ class Cloth(Body):
             membrane_poisson=self.poisson,
             thickness=self.thickness,
         )
-        return (membrane, *self._bending(start), *self._threads(start))
+        return (membrane, *self._bending(start), *self._threads(start), *self._limits(start))
+
+    def _limits(self, start: int) -> tuple[StencilGroup, ...]:
+        if self.strain_limit is None or self.limit_stiffness is None:
+            return ()
+        rows = np.concatenate([self.strain_limit, self.limit_stiffness[:, None]], axis=1)
+        corners = self.elements + start
+        return (StencilGroup.of("cloth_limit", corners, self._rest.gradients, self.areas, cloth_limit=rows),)
 
     def _bending(self, start: int) -> tuple[StencilGroup, ...]:
         hinges = self._hinges

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,14 +17,17 @@ from numpy.typing import NDArray
 from ..common.checks import as_array, check_finite, check_scalar, check_shape, check_vector
 from ..common.synonyms import Renamed, check_arguments
 from ..common.warn import SceneWarning, warn_user
+from ..geometry.mesh_quality import shape_gradients
 from ..geometry.tet_mesh import TetMesh
 from .averaging import average_over
+from .limits import limit_rows
 from .part import (
     Array,
     ArrayLike,
     Body,
     Index,
     KeyPart,
+    Place,
     ScenePart,
     check_body,
     per_item,
@@ -32,6 +35,7 @@ from .part import (
     selected,
     set_fields,
 )
+from .stencils import StencilGroup
 
 __all__ = ["Damping", "Gravity", "Ground", "Pin", "Solid", "Sphere"]
 
@@ -39,6 +43,7 @@ __all__ = ["Damping", "Gravity", "Ground", "Pin", "Solid", "Sphere"]
 # and a step would have several solutions.
 _LEAST_RESISTANCE = 0.1
 # Poisson's ratios [low, high) that a solid may have, and above which a step takes many iterations.
+_LARGEST_GROUP = 4  # of tetrahedra, see csrc/plan/mesh/elements.h
 _LOWEST, _HIGHEST, _SLOW = -1.0, 0.495, 0.45
 
 
@@ -50,8 +55,12 @@ class Solid(Body):
     nearest rotation, and w Young's modulus (Vyatkin and Dolgovesov 2023, where st = w / 2).
 
     With one, it is V (mu |F - R|^2 + lambda t^2 / 2), t = tr(R^T F) - 3 and Lame's constants mu and lambda: the
-    corotated linear law. Where lambda t > 2 mu, the pressure stays at 2 mu, so that a step cannot diverge. Linear
+    "corotated" linear law. Where lambda t > 2 mu, the pressure stays at 2 mu, so that a step cannot diverge. Linear
     tetrahedra are too stiff near nu = 1/2; groups of them share the mean of t, weighted by V lambda.
+
+    The law "volume" is V (mu |F - R|^2 + 3 lambda / 2 dist^2(F, {det F = 1})), with the volume constraint of Bouaziz
+    et al. (2014). It has the same linear elasticity, and keeps its volume at large strains, where the corotated law
+    loses it. An iteration costs more, and single tetrahedra are too stiff near nu = 1/2.
 
     Tetrahedra that are partly empty (`mesh.fill`, from `tetrahedralize`) have mass and stiffness in proportion. The
     stiffness is at least a tenth of the full one (Nesme et al. 2009, for embedded surfaces).
@@ -65,7 +74,15 @@ class Solid(Body):
             needs many iterations, and a `SceneWarning` says so. The scalar 0 compiles lambda away.
         averaging: tetrahedra that share the mean of t: 1, 2 or 4 at most, or the number of a group for each
             tetrahedron [E]. None: 2 for the lattice of `tetrahedralize`, which hardly locks, and 4 otherwise. Groups
-            of 2 and 4 share faces and have similar bulk moduli.
+            of 2 and 4 share faces and have similar bulk moduli. The law "volume" averages nothing.
+        law: "corotated" or "volume". "volume" takes a positive Poisson's ratio.
+        strain_limit: least and largest stretch (lo, hi), or one pair per tetrahedron [E, 2], lo <= 1 <= hi; None: no
+            limit. Beyond them V k / 2 dist^2(F, {stretches in [lo, hi], det F > 0}) adds to the energy.
+        limit_stiffness: k [Pa], a scalar or one value per tetrahedron. None: 30 times Young's modulus. It is a
+            stiffness, not a clamp: 10 to 100 times Young's modulus hold most of an excess.
+        stiffness_damping: beta [s], a scalar or one value per tetrahedron: Rayleigh damping by the stiffness, in the
+            frame of the material. The axial stress of a step is 2 mu beta (s - s_t) / h beside the elastic one. A rigid
+            rotation feels none. It acts by mu alone, also with a Poisson's ratio.
 
     Example:
         >>> rubber = Solid(mesh, youngs=1e6, poisson=0.4, density=1100.0)
@@ -76,6 +93,10 @@ class Solid(Body):
     density: Array
     poisson: Array | float  # [E], or 0.0
     averaging: int | Index | None
+    law: Literal["corotated", "volume"]
+    strain_limit: Array | None  # [E, 2]
+    limit_stiffness: Array | None  # [E]
+    stiffness_damping: Array | float  # [E], or 0.0
 
     @check_arguments("Solid")
     def __init__(
@@ -86,6 +107,10 @@ class Solid(Body):
         *,
         poisson: ArrayLike = 0.0,
         averaging: int | Sequence[int] | NDArray[Any] | torch.Tensor | None = None,
+        law: Literal["corotated", "volume"] = "corotated",
+        strain_limit: Any = None,
+        limit_stiffness: ArrayLike | None = None,
+        stiffness_damping: ArrayLike = 0.0,
     ) -> None:
         if not isinstance(mesh, TetMesh):
             raise TypeError(
@@ -94,13 +119,19 @@ class Solid(Body):
             )
         report_size("Solid", "mesh", mesh.vertices, mesh.tets)
         count = len(mesh.tets)
+        modulus = per_item("Solid.youngs", youngs, count, of="tetrahedron", unit="Pa")
+        limits = limit_rows("Solid", strain_limit, limit_stiffness, modulus, of="tetrahedron", unit="Pa")
         set_fields(
             self,
             mesh=mesh,
-            youngs=per_item("Solid.youngs", youngs, count, of="tetrahedron", unit="Pa"),
+            youngs=modulus,
             density=per_item("Solid.density", density, count, of="tetrahedron", unit="kg/m^3"),
             poisson=_poisson(poisson, count),
             averaging=_averaging(averaging, count),
+            law=_law(law, poisson),
+            strain_limit=None if limits is None else limits[:, :2],
+            limit_stiffness=None if limits is None else limits[:, 2],
+            stiffness_damping=_stiffness_damping(stiffness_damping, count),
         )
 
     @property
@@ -111,6 +142,23 @@ class Solid(Body):
     def stiffness(self) -> Array:
         """Young's modulus times fill [E] Pa, with a fill of at least 0.1."""
         return self._filled(self.youngs, _LEAST_RESISTANCE)
+
+    def stencils(self, place: Place) -> tuple[StencilGroup, ...]:
+        is_damped = not isinstance(self.stiffness_damping, float)
+        if self.strain_limit is None and self.law != "volume" and not is_damped:
+            return ()
+        corners, tets = self.mesh.tets + place(self), np.arange(len(self.mesh.tets), dtype=np.int64)
+        gradients, volumes = shape_gradients(self.mesh.vertices, self.mesh.tets)
+        groups = []
+        if self.strain_limit is not None and self.limit_stiffness is not None:
+            stiffness = self._filled(self.limit_stiffness, _LEAST_RESISTANCE)
+            rows = np.concatenate([self.strain_limit, stiffness[:, None]], axis=1)
+            groups.append(StencilGroup.of("solid_limit", corners, gradients, volumes, solid_limit=rows))
+        if self.law == "volume":
+            groups.append(StencilGroup.of("volume", corners, gradients, volumes, tets=tets))
+        if is_damped:
+            groups.append(StencilGroup.of("damper", corners, gradients, volumes, tets=tets))
+        return tuple(groups)
 
     @property
     def filled_density(self) -> Array:
@@ -159,7 +207,21 @@ def _poisson(value: ArrayLike, count: int) -> Array | float:
     return array
 
 
-_LARGEST_GROUP = 4  # of tetrahedra, see csrc/plan/mesh/elements.h
+def _stiffness_damping(value: ArrayLike, count: int) -> Array | float:
+    array = per_item("Solid.stiffness_damping", value, count, of="tetrahedron", unit="s", zero=True)
+    return array if array.any() else 0.0
+
+
+def _law(value: Any, poisson: ArrayLike) -> Literal["corotated", "volume"]:
+    if value not in ("corotated", "volume"):
+        raise ValueError(f'Solid.law must be "corotated" or "volume", got {value!r}')
+    least = np.min(as_array("Solid.poisson", poisson, np.float64))
+    if value == "volume" and not least > 0.0:
+        raise ValueError(
+            f'Solid.poisson must be positive for law="volume", whose volume energy is proportional to lambda, got '
+            f'{least:g}; take law="corotated"'
+        )
+    return "volume" if value == "volume" else "corotated"
 
 
 def _averaging(value: Any, count: int) -> int | Index | None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,8 @@ class SceneValues:
     loose: NDArray[np.bool_]  # [components] whether hard pins leave a component rigid motions
     stencils: tuple[StencilGroup, ...] = ()  # at most one group per kind, in the order of `stencils.KINDS`
     poisson: Array | None = None  # [E] Poisson's ratio, None where every solid has the scalar 0
-    tet_group: Index | None = None  # [E] numbers of the groups that share a volume strain, None without `poisson`
+    tet_group: Index | None = None  # [E] groups that share a volume strain, -1: none; None without `poisson`
+    stiffness_damping: Array | None = None  # [E] s, None where no solid has any
     pressure: Array | None = None  # [pressures] Pa, None without any
     wind: Array | None = None  # [3] m/s, None without
 
@@ -204,7 +205,7 @@ class Scene:
         pin_vertices = self._pinned()
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
-        stencils = merge_groups(group for part in self.parts for group in part.stencils(lambda body: starts[id(body)]))
+        stencils = merge_groups(self._stencils(starts))
         masses = np.concatenate([body.masses() for body in self.bodies])
         component = _joined(self._components(), stencils)
         pinned = PinnedComponents.of(positions, masses, component, pin_vertices)
@@ -230,9 +231,18 @@ class Scene:
             stencils=stencils,
             poisson=poisson,
             tet_group=tet_group,
+            stiffness_damping=self._stiffness_damping(),
             pressure=np.array([part.pascals for part in self.pressures]) if self.pressures else None,
             wind=None if self.wind is None else self.wind.velocity,
         )
+
+    def _stencils(self, starts: dict[int, int]) -> Iterator[StencilGroup]:
+        """Stencils of all parts, by vertices and tetrahedra of the scene."""
+        tets = 0
+        for part in self.parts:
+            for group in part.stencils(lambda body: starts[id(body)]):
+                yield group if group.tets is None else replace(group, tets=group.tets + tets)
+            tets += len(part.mesh.tets) if isinstance(part, Solid) else 0
 
     def _components(self) -> Index:
         """Number of the connected component of each vertex within its body [V]."""
@@ -256,9 +266,27 @@ class Scene:
         """Numbers of the groups of tetrahedra that share the mean of their volume strain [E]."""
         groups, count = [np.zeros(0, dtype=np.int64)], 0
         for solid in self.solids:
+            if solid.law == "volume":  # a kind of its own has their volume energy
+                groups.append(np.full(len(solid.mesh.tets), -1))
+                continue
             groups.append(solid.averaging_groups + count)
             count = int(groups[-1].max()) + 1
         return np.concatenate(groups)
+
+    @property
+    def damped_tets(self) -> NDArray[np.bool_]:
+        """Whether the solid of each tetrahedron has stiffness-proportional damping [E]."""
+        solids = self.solids
+        return np.repeat(
+            [not isinstance(solid.stiffness_damping, float) for solid in solids],
+            [len(solid.mesh.tets) for solid in solids],
+        )
+
+    def _stiffness_damping(self) -> Array | None:
+        """Coefficients of all tetrahedra [E] s, or None without damping."""
+        if all(isinstance(solid.stiffness_damping, float) for solid in self.solids):
+            return None
+        return np.concatenate([np.broadcast_to(s.stiffness_damping, len(s.mesh.tets)) for s in self.solids])
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(type(part).__name__ for part in self.parts)})"

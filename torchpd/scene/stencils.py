@@ -26,6 +26,12 @@ class Kind(NamedTuple):
     columns: int  # d, columns of F
     constants: int  # c, further constants of a stencil
     rows: tuple[str, ...]
+    of_tets: bool = False  # whether these are rows of tetrahedra, so that the kind has none of its own
+
+    @property
+    def own_rows(self) -> tuple[str, ...]:
+        """Names of the rows that the kind has for each of its stencils."""
+        return () if self.of_tets else self.rows
 
 
 # In the order in which a scene lists them.
@@ -36,6 +42,10 @@ KINDS: dict[str, Kind] = {
     "tie": Kind(5, 1, 0, ("tie_stiffness",)),
     "fibre": Kind(4, 1, 1, ("fibre_stiffness", "fibre_length")),
     "thread": Kind(3, 1, 0, ("thread_stiffness",)),
+    "solid_limit": Kind(4, 3, 0, ("solid_limit",)),
+    "cloth_limit": Kind(3, 2, 0, ("cloth_limit",)),
+    "volume": Kind(4, 3, 0, ("stiffness", "poisson"), of_tets=True),
+    "damper": Kind(4, 3, 0, ("stiffness", "poisson", "stiffness_damping"), of_tets=True),
 }
 
 
@@ -50,6 +60,10 @@ class StencilGroup:
     - tie: F is x0 - sum b_a x_a [m], V is 1; k/2 |F|^2.
     - fibre: F is that of its tetrahedron times f, V the volume of its material [m^3]; w/2 (|F| - L)^2.
     - thread: F is that of its triangle times f, V the area [m^2]; w/2 (|F| - 1)^2.
+    - solid_limit, cloth_limit: F and V of a tetrahedron or a triangle; k/2 dist^2(F, {stretches in [lo, hi]}), also
+      det F > 0 of a tetrahedron.
+    - volume: F and V of a tetrahedron; 3 lambda/2 dist^2(F, {det F = 1}).
+    - damper: F and V of a tetrahedron; mu beta/h |F - R U_t|^2, U_t the stretch at the start of a step.
     """
 
     kind: str
@@ -58,17 +72,26 @@ class StencilGroup:
     measure: Array  # [N] V
     constants: Array  # [N, c]; of a fibre: 1 if it has no energy for |F| < L, else 0
     material: dict[str, Array]  # trainable rows by name, [N] or [N, width]
+    tets: Index | None = None  # [N] tetrahedra whose rows of the material the kind reads instead of its own
 
     def __len__(self) -> int:
         return len(self.corners)
 
     @staticmethod
     def of(
-        kind: str, corners: Index, gradients: Array, measure: Array, *, constants: Array | None = None, **rows: Array
+        kind: str,
+        corners: Index,
+        gradients: Array,
+        measure: Array,
+        *,
+        constants: Array | None = None,
+        tets: Index | None = None,
+        **rows: Array,
     ) -> StencilGroup:
         """Build a group, without constants by default; rows come in the order of the kind."""
         given = np.zeros((len(corners), 0)) if constants is None else constants
-        return StencilGroup(kind, corners, gradients, measure, given, {name: rows[name] for name in KINDS[kind].rows})
+        own = {name: rows[name] for name in KINDS[kind].own_rows}
+        return StencilGroup(kind, corners, gradients, measure, given, own, tets)
 
 
 def merge_groups(groups: Iterable[StencilGroup]) -> tuple[StencilGroup, ...]:
@@ -86,5 +109,8 @@ def _joined(kind: str, groups: Sequence[StencilGroup]) -> StencilGroup:
         gradients=np.concatenate([group.gradients for group in groups]),
         measure=np.concatenate([group.measure for group in groups]),
         constants=np.concatenate([group.constants for group in groups]),
-        material={name: np.concatenate([group.material[name] for group in groups]) for name in KINDS[kind].rows},
+        material={name: np.concatenate([group.material[name] for group in groups]) for name in KINDS[kind].own_rows},
+        tets=np.concatenate([group.tets for group in groups if group.tets is not None])
+        if KINDS[kind].of_tets
+        else None,
     )

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
@@ -32,6 +33,7 @@ from ..plan.placement import plan_after_release, plan_for_solver
 from ..plan.preconditioner import has_outliers, has_preconditioner
 from ..scene.averaging import check_signs
 from ..scene.pins import PIN_HARD, split_springs
+from ..scene.scene import Scene
 from .parametrization import apply_parametrization, invert_parametrization, parametrization
 
 __all__ = [
@@ -98,6 +100,8 @@ def check_change(
             )
     if "poisson" in checked:
         check_signs(f"{owner}: poisson", checked["poisson"].cpu().double().numpy(), compiled.scene.averaging_groups)
+    if "stiffness_damping" in checked:
+        _check_damped(owner, checked["stiffness_damping"], compiled.scene)
     if replaces_hard:
         checked[PIN_HARD] = check_pin_hard(owner, hard, own[PIN_HARD])
     hard_of_springs = {PIN_HARD: checked["pin_stiffness"]} if "pin_stiffness" in checked else {}
@@ -120,10 +124,26 @@ def check_change(
         return MaterialChange(checked, originals, replaced, _updated_plan(compiled, own, checked), new_trainable)
 
 
+def _check_damped(owner: str, seconds: Tensor, scene: Scene) -> None:
+    """Refuse damping of tetrahedra whose solid has none compiled in."""
+    given = (seconds.detach().cpu() != 0.0).reshape(-1, seconds.shape[-1]).any(0).numpy()
+    bad = np.flatnonzero(given & ~scene.damped_tets)
+    if bad.size:
+        raise ValueError(
+            f"{owner}: stiffness_damping must be 0 in tetrahedra of a solid without it, got another number at "
+            f"{int(bad[0])} ({bad.size} in all); give that Solid(stiffness_damping=) a number, too"
+        )
+
+
 def _hint(name: str) -> str:
     """What to do instead of setting an array that a scene lacks."""
     if name == "poisson":
         return "; every solid has poisson=0.0, which leaves it out: give Solid(poisson=) another number or an array"
+    if name == "stiffness_damping":
+        return "; every solid has stiffness_damping=0.0, which leaves it out: give Solid(stiffness_damping=)"
+    if name in ("solid_limit", "cloth_limit"):
+        part = "solid" if name == "solid_limit" else "cloth"
+        return f"; no {part} has a strain_limit, which leaves it out: give {part.title()}(strain_limit=)"
     if name in MATERIAL_ROWS:
         rows = MATERIAL_ROWS[name].rows
         return f"; the scene has no {name if rows == 'one' else rows}"

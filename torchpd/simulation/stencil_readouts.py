@@ -24,7 +24,7 @@ from ..scene.scene import Scene
 from ..scene.springs import Springs
 from ..scene.tie import Tie
 
-__all__ = ["MembraneStress", "Tension", "forces_of_ties", "membrane_stress", "tensions"]
+__all__ = ["MembraneStress", "Tension", "forces_of_ties", "has_membrane_stress", "membrane_stress", "tensions"]
 
 
 class MembraneStress(NamedTuple):
@@ -89,8 +89,18 @@ def _columns(rest: _Rest, positions: Tensor, rows: slice) -> list[Tensor]:
 # ---- cloth
 
 
+def has_membrane_stress(scene: Scene) -> bool:
+    """Whether the formulas of `membrane_stress` have the whole energy in the plane of all cloth."""
+    return all(body.strain_limit is None for body in scene.bodies if isinstance(body, Cloth))
+
+
 def membrane_stress(scene: Scene, positions: Tensor, material: dict[str, Tensor]) -> dict[Cloth, MembraneStress]:
     """Implementation of `Simulator.membrane_stress` for checked positions [B, V, 3] and material by name."""
+    if not has_membrane_stress(scene):
+        raise ValueError(
+            "membrane_stress: every cloth must have no strain_limit, whose stress is not provided, got one with it; "
+            "sim.gradient(state) has the elastic forces of all"
+        )
     found: dict[Cloth, MembraneStress] = {}
     for body in scene.bodies:
         if isinstance(body, Cloth):

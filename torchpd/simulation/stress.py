@@ -26,7 +26,7 @@ from ..common.small_matrices import dot, product, root
 from ..ops.registration import nearest_rotation
 from ..scene.scene import Scene
 
-__all__ = ["Stress", "stress", "vertex_average"]
+__all__ = ["Stress", "has_stress", "stress", "vertex_average"]
 
 
 class Stress(NamedTuple):
@@ -113,8 +113,18 @@ def _pressure(groups: _Groups, F: Tensor, R: Tensor, double_shear: Tensor, bulk:
     return bulk * torch.minimum(mean, groups.sums(cap, "min"))[..., groups.of]
 
 
+def has_stress(scene: Scene) -> bool:
+    """Whether the formulas of `stress` have the whole energy of all solids."""
+    return all(solid.law == "corotated" and solid.strain_limit is None for solid in scene.solids)
+
+
 def stress(scene: Scene, positions: Tensor, stiffness: Tensor, poisson: Tensor | None = None) -> Stress:
     """Implementation of `Simulator.stress` for checked positions [B, V, 3], stiffness and `poisson` [E] or [B, E]."""
+    if not has_stress(scene):
+        raise ValueError(
+            'stress: every solid must have law="corotated" and no strain_limit, whose stress is not provided, got '
+            "another one; sim.gradient(state) has the elastic forces of all"
+        )
     rest = _rest(scene, positions.device, positions.dtype)
     corners = positions[:, rest.tets]
     F = product((corners[:, :, 1:] - corners[:, :, :1]).mT, rest.inverse_edges)

@@ -9,9 +9,11 @@ for segments of rods and for springs, in this order. Files have these fields, th
             velocity          [m/s]
             tie_force         [N], of ties, on both bodies
     cells   stress            of tetrahedra [Pa], nine numbers row by row, NaN in inverted ones
-            von_mises         of tetrahedra [Pa], NaN in inverted ones
+            von_mises         of tetrahedra [Pa], NaN in inverted ones; both absent where a solid has a strain limit
+                              or law="volume"
             fibre_tension     of tetrahedra [Pa], the sum over their fibres
-            membrane_stress   of triangles [N/m], larger and smaller principal value, NaN in collapsed ones
+            membrane_stress   of triangles [N/m], larger and smaller principal value, NaN in collapsed ones; absent
+                              where a cloth has a strain limit
             tension           of lines [N]
             strain            of lines
             body              number of the body; -1 of springs
@@ -44,8 +46,8 @@ from ..scene.part import Body
 from ..scene.scene import Scene
 from ..scene.springs import Springs
 from .state import State, Track
-from .stencil_readouts import forces_on_tied, membrane_stress, tensions
-from .stress import stress
+from .stencil_readouts import forces_on_tied, has_membrane_stress, membrane_stress, tensions
+from .stress import has_stress, stress
 
 __all__ = ["States", "write_vtu"]
 
@@ -185,11 +187,12 @@ def _own_fields(
     rest = positions.new_tensor(scene.rest_positions)
     points = {"displacement": positions - rest, "velocity": state.velocities[chosen]}
     cells: dict[str, tuple[str, Tensor]] = {}
-    if scene.solids:
+    if scene.solids and has_stress(scene):
         found = stress(scene, positions[None], material["stiffness"], material.get("poisson"))
         cells["stress"] = "tetra", found.cauchy[0].flatten(1)
         cells["von_mises"] = "tetra", found.von_mises[0]
-    if sheets := membrane_stress(scene, positions[None], material):
+    sheets = membrane_stress(scene, positions[None], material) if has_membrane_stress(scene) else {}
+    if sheets:
         cells["membrane_stress"] = "triangle", torch.cat([sheet.principal[0] for sheet in sheets.values()])
     pulls = tensions(scene, positions[None], material)
     if lines := [pull for part, pull in pulls.items() if not isinstance(part, Fibres)]:

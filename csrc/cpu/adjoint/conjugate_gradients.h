@@ -98,7 +98,8 @@ class ConjugatePass {
   void load(bool begins) {
     const T per_unit = T(1) / unit_;
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      w_.x[i] = read(call_.positions, i);
+      w_.x[i] = read(call_.start ? call_.start : call_.positions, i);
+      if (call_.start) w_.u[i] = read(call_.positions, i) - w_.x[i];
       solution()[i] = begins ? to_quad<T>(0, 0, 0) : per_unit * read(call_.solution, i);
       residual()[i] = per_unit * read(call_.residual, i);
       direction()[i] = per_unit * read(call_.direction, i);
@@ -111,6 +112,10 @@ class ConjugatePass {
     team_.barrier();
     sweep_.set_origins();
     team_.barrier();
+    if (plan_.remembers) {
+      sweep_.begin_stencils();
+      team_.barrier();
+    }
     sweep_.run(0, Elements{KeepJacobians<T>{jacobians_}, NoStencils{}},
                [](std::int64_t, const Quad<T>&, Sum&) {});
   }

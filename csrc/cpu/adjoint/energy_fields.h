@@ -1,6 +1,7 @@
 // Elastic energy and its derivatives at given positions, and their diagonal, environment by environment.
 #pragma once
 #include "cpu/step/sweep.h"
+#include "elements/solid_fields.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -20,6 +21,7 @@ class FieldPass {
         sweep_{plan_, work, scratch, team} {}
 
   void run(std::int64_t environment) {
+    const auto none = one_by_one([](const auto&, int) {});
     load(environment);
     if (call_.field == Field::gradient) {
       vertex_field<1, 3>(environment, elastic_gradient<false>());
@@ -33,8 +35,14 @@ class FieldPass {
       sum_energy(environment);
     } else if (call_.field == Field::stiffness_at_rest) {
       write_stiffness(environment);
-    } else if (call_.field == Field::effect_products) {
+    } else if (call_.field == Field::effect_products || call_.field == Field::damping_products) {
       differentiate_by_effects(environment);
+    } else if (call_.field == Field::damping_gradient) {
+      vertex_field<1, 3>(environment, Elements{none, Dissipating<StencilGradient<false>>{}});
+    } else if (call_.field == Field::damping_product) {
+      vertex_field<2, 3>(environment, Elements{none, Dissipating<StencilHessian>{}});
+    } else if (call_.field == Field::damping_start) {
+      differentiate_by_start(environment);
     } else if (call_.field == Field::element_energy) {
       element_field<1, 1>(environment, ElementEnergy{});
     } else if (call_.field == Field::element_energy_product) {
@@ -69,6 +77,9 @@ class FieldPass {
     team_.barrier();
     sweep_.set_origins();
     team_.barrier();
+    if (!plan_.remembers) return;
+    sweep_.begin_stencils();
+    team_.barrier();
   }
 
   template <int Fields, int Components, class Element>
@@ -95,33 +106,57 @@ class FieldPass {
     const MatrixStiffness<T> stiffness(call_.stiffness, call_.effects, environment);
     for (std::int64_t t = team_.begin(plan_.tets); t < team_.end(plan_.tets); ++t)
       out[t] = stiffness(t);
-    each_stencil_stiffness(plan_, call_.effects, environment, team_.begin(plan_.stencil_blocks),
-                           team_.end(plan_.stencil_blocks),
+    each_stencil_stiffness(plan_, call_.effects, environment, call_.per_time,
+                           team_.begin(plan_.stencil_blocks), team_.end(plan_.stencil_blocks),
                            [&](T w, std::int64_t n) { out[n] = w; });
   }
 
-  // Each stencil writes to its own row.
+  // By the positions at the start: first by the memory of each stencil, which stands in its place, then by them.
+  void differentiate_by_start(std::int64_t environment) {
+    for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
+      sweep_.template gather_slots<2>(patch);
+      sweep_.template stencils_of<2>(patch, StencilMemorySlope{});
+    }
+    team_.barrier();
+    const Quad<T> zero = to_quad<T>(0, 0, 0);
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
+      w_.u[i] = zero;
+    team_.barrier();
+    const auto none = one_by_one([](const auto&, int) {});
+    vertex_field<1, 3>(environment, Elements{none, StencilStartSlope{}});
+  }
+
+  // Each stencil adds to its own row of an array. Kinds may share the rows of tetrahedra, and take turns.
   void differentiate_by_effects(std::int64_t environment) {
     if (plan_.stencil_blocks == 0) return;
-    for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
-      call_.direction ? sweep_.template gather_slots<2>(patch)
-                      : sweep_.template gather_slots<1>(patch);
-      each_stencil<Batch<T, 1>>(plan_, patch, [&](auto kind, const StencilPart<T>& part) {
-        using Kind = decltype(kind);
-        if (plan_.stencil_measure[part.stencil()] != T(0)) write_products<Kind>(environment, part);
-      });
+    const bool damping = call_.field == Field::damping_products;
+    for (int number = 0; number < int(KindNumber::count); ++number) {
+      if (plan_.stencil_sizes[stencil_size_count + number] == 0) continue;
+      for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
+        call_.direction ? sweep_.template gather_slots<2>(patch)
+                        : sweep_.template gather_slots<1>(patch);
+        each_stencil<Batch<T, 1>>(plan_, patch, [&](auto kind, const StencilPart<T>& part) {
+          using Kind = decltype(kind);
+          if (kind_number<Kind> == number && dissipates<Kind> == damping &&
+              plan_.stencil_measure[part.stencil()] != T(0))
+            add_products<Kind>(environment, part);
+        });
+      }
+      team_.barrier();
     }
   }
 
   template <class Kind>
-  void write_products(std::int64_t environment, const StencilPart<T>& part) {
-    constexpr EffectsOf<Kind> effects;
-    const int number = plan_.stencil_order[part.stencil()];
-    const MaterialRows<Kind, T> rows(call_.effects, environment);
-    T g[gradient_numbers<Kind>], c[constant_slots<Kind>] = {}, row[Kind::rows];
+  void add_products(std::int64_t environment, const StencilPart<T>& part) {
+    constexpr ArraysOf<Kind> arrays;
+    const int number = plan_.stencil_row[part.stencil()];
+    T g[gradient_numbers<Kind>], c[constant_slots<Kind>] = {}, row[Kind::rows] = {};
     for (int i = 0; i < gradient_numbers<Kind>; ++i) g[i] = *part.stored(i);
     for (int i = 0; i < Kind::constants; ++i) c[i] = *part.stored(gradient_numbers<Kind> + i);
-    for (int i = 0; i < Kind::rows; ++i) row[i] = rows.row[i][number];
+    MaterialRows<Kind, T>(call_.effects, environment).values(number, row);
+    T memory[memory_of<Kind> + 1];
+    for (int i = 0; i < memory_of<Kind>; ++i)
+      memory[i] = w_.numbers[part.number(Kind::numbers - memory_of<Kind> + i)];
     Vec3<T> x[Kind::corners], f[Kind::dims], df[Kind::dims] = {};
     for (int a = 0; a < Kind::corners; ++a) x[a] = to_vec3(scratch_.x[*part.corner(a)]);
     deform<Kind>(x, g, f);
@@ -129,12 +164,16 @@ class FieldPass {
       for (int a = 0; a < Kind::corners; ++a) x[a] = to_vec3(scratch_.direction[*part.corner(a)]);
       deform<Kind>(x, g, df);
     }
-    const std::int64_t count = plan_.stencil_sizes[stencil_size_count + kind_number<Kind>];
-    for (int i = 0; i < Kind::rows; ++i) {
-      T* out = call_.products[effects.effect[i]];
-      if (!out) continue;
-      const RowDerivative<Kind, T> by(i, row, plan_.stencil_measure[part.stencil()], f, df, c);
-      out[environment * count + number] = call_.direction ? by.product : by.energy;
+    const std::int64_t count =
+        reads_tets<Kind> ? plan_.tets : plan_.stencil_sizes[stencil_size_count + kind_number<Kind>];
+    for (int a = 0; a < arrays.count; ++a) {
+      if (!call_.products[arrays.effect[a]]) continue;
+      T* out = call_.products[arrays.effect[a]] + (environment * count + number) * arrays.width(a);
+      for (int i = 0; i < arrays.width(a); ++i) {
+        const RowDerivative<Kind, T> by(arrays.first[a] + i, row,
+                                        sweep_.template measure<Kind>(part), f, df, c, memory);
+        out[i] = out[i] + (call_.direction ? by.product : by.energy);
+      }
     }
   }
 
@@ -152,10 +191,10 @@ class FieldPass {
         const auto write = [&](const auto& elements, int s, const auto&... number) {
           write_lanes<Numbers>(environment, elements.part(s), {number...});
         };
-        each_element(plan_, patch,
-                     ElementsAcross<Fields, T, Members>(plan_, corners, w_.weights(), nullptr,
-                                                        unused),
-                     Written<Element, decltype(write)>{element, write});
+        each_element(
+            plan_, patch,
+            ElementsAcross<Fields, T, Members>(plan_, corners, w_.weights(), nullptr, unused),
+            Written<Element, decltype(write)>{element, write});
       });
     }
   }
@@ -189,7 +228,9 @@ class FieldPass {
   // By E and nu, from slopes by V 2 mu and V lambda.
   void to_parameters(std::int64_t environment, std::int64_t e, T* slope) const {
     const int32 t = plan_.tet_order[e];
-    const LameSlopes<T> by(call_.stiffness.of(environment)[t], call_.effects.poisson.of(environment)[t]);
+    const LameSlopes<T> by(call_.stiffness.of(environment)[t],
+                           call_.effects.poisson.of(environment)[t]);
+    if (plan_.tet_bound[e] < 0) slope[1] = 0;  // without lambda
     by.chain(plan_.tet_volume[e], slope);
   }
 

@@ -14,6 +14,7 @@ struct MismatchRunner {
   const Plan<T>& plan;
   const StepCall<T>& call;
   std::int64_t environment;
+  T per_time;  // 1 / h
   const Team& team;
   Range (*ranges)[ranges_count];  // one row a thread
   Inertia inertia;
@@ -23,8 +24,8 @@ struct MismatchRunner {
     const MatrixStiffness<T> stiffness(call.material.stiffness, call.effects, environment);
     for (std::int64_t t = team.begin(plan.tets); t < team.end(plan.tets); ++t)
       visit(stiffness(t), t);
-    each_stencil_stiffness(plan, call.effects, environment, team.begin(plan.stencil_blocks),
-                           team.end(plan.stencil_blocks), visit);
+    each_stencil_stiffness(plan, call.effects, environment, per_time,
+                           team.begin(plan.stencil_blocks), team.end(plan.stencil_blocks), visit);
   }
 
   template <class Visit>

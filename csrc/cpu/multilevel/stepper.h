@@ -391,8 +391,8 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
       const auto inertia = [&](std::int64_t i) {
         return Lanes::lane(Lanes::widen(w_.inertia[i]), lane);
       };
-      MismatchRunner<T, decltype(inertia)> run{plan_, call_,     in_.environment(lane),
-                                               team_, o_.ranges, inertia};
+      MismatchRunner<T, decltype(inertia)> run{
+          plan_, call_, in_.environment(lane), w_.per_time, team_, o_.ranges, inertia};
       mismatch_[lane] = measure_mismatch(run, plan_.levels);
       Lanes::set_lane(outliers_.trusted, lane, T(mismatch_[lane].trusted));
       outliers_.some = outliers_.some || mismatch_[lane].has_outliers;

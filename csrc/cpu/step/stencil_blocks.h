@@ -32,7 +32,7 @@ struct StencilsAcross<Kind, Fields, Single<T>> {
 
   StencilPart<T> part;
   const Quad<T>* const (&field)[Fields];
-  const T* numbers;
+  T* numbers;
   bool shared;
   Quad<T>* forces;
   LaneSums<Single<T>>& sums;
@@ -42,6 +42,12 @@ struct StencilsAcross<Kind, Fields, Single<T>> {
   }
   PD_HD R stored(int number) const { return R::load(part.stored(number)); }
   PD_HD R number(int i) const { return R::load(numbers + part.number(i)); }
+  PD_HD void remember(const R (&memory)[memory_of<Kind>]) const
+    requires(memory_of<Kind> > 0)
+  {
+    for (int i = 0; i < memory_of<Kind>; ++i)
+      memory[i].store(numbers + part.number(Kind::numbers - memory_of<Kind> + i));
+  }
   PD_HD R bound() const { return R::load(part.plan->stencil_bound + part.stencil()); }
   PD_HD R& sum() const { return sums.part[part.first_lane / W]; }
   PD_HD void add(const Vec3<R> (&force)[Kind::corners]) const {
@@ -63,7 +69,7 @@ struct StencilsAcross<Kind, Fields, Batch<T, W>> {
 
   StencilPart<T> part;
   const Vec3<R>* const (&field)[Fields];
-  const T* numbers;
+  T* numbers;
   bool shared;  // numbers are those of all environments
   Vec3<R>* forces;
   LaneSums<Batch<T, W>>& sums;
@@ -75,6 +81,13 @@ struct StencilsAcross<Kind, Fields, Batch<T, W>> {
   PD_HD R number(int i) const {
     return shared ? R(numbers[part.number(i)]) : R::load(numbers + part.number(i) * W);
   }
+  // not where environments share their numbers
+  PD_HD void remember(const R (&memory)[memory_of<Kind>]) const
+    requires(memory_of<Kind> > 0)
+  {
+    for (int i = 0; i < memory_of<Kind>; ++i)
+      memory[i].store(numbers + part.number(Kind::numbers - memory_of<Kind> + i) * W);
+  }
   PD_HD R bound() const { return R(part.plan->stencil_bound[part.stencil()]); }
   PD_HD R& sum() const { return sums.part[part.first_lane]; }
   PD_HD void add(const Vec3<R> (&force)[Kind::corners]) const {
@@ -84,11 +97,11 @@ struct StencilsAcross<Kind, Fields, Batch<T, W>> {
 };
 
 // visit(w, n) for every stencil of some blocks: its stiffness at rest per measure, and its number after the
-// tetrahedra, kind by kind.
+// tetrahedra, kind by kind. `per_time`: 1 / h, or 0 where nothing dissipates.
 template <class T, class Visit>
 void each_stencil_stiffness(const Plan<T>& plan, const Effects<T>& effects,
-                            std::int64_t environment, std::int64_t begin, std::int64_t end,
-                            const Visit& visit) {
+                            std::int64_t environment, T per_time, std::int64_t begin,
+                            std::int64_t end, const Visit& visit) {
   for (std::int64_t b = begin; b < end; ++b) {
     const int number = plan.stencil_block[4 * b];
     std::int64_t first = plan.tets;
@@ -100,8 +113,8 @@ void each_stencil_stiffness(const Plan<T>& plan, const Effects<T>& effects,
         const StencilPart<T> part{&plan, int(b), lane};
         if (plan.stencil_measure[part.stencil()] == T(0)) continue;
         T numbers[Kind::numbers];
-        rows.read(plan.stencil_order[part.stencil()], T(1), numbers);
-        visit(Kind::weight(numbers, T(1), T(1)), first + plan.stencil_order[part.stencil()]);
+        rows.read(plan.stencil_row[part.stencil()], dissipates<Kind> ? per_time : T(1), numbers);
+        visit(rest_weight<Kind>(numbers), first + plan.stencil_order[part.stencil()]);
       }
     });
   }

@@ -61,6 +61,8 @@ class Stepper {
       });
     sweep_.set_origins();
     team_.barrier();
+    sweep_.begin_stencils();
+    if (plan_.remembers) team_.barrier();
   }
 
   void start() {

@@ -111,9 +111,10 @@ struct Sweep {
     }
   }
 
+  // The numbers of all stencils but their memory.
   template <class EnvironmentOf>
   void set_stencil_numbers(const Effects<T>& effects, const EnvironmentOf& environment_of) {
-    const int lanes = work.shared_weight ? 1 : Lanes::environments;
+    const int lanes = work.shared_numbers ? 1 : Lanes::environments;
     for (std::int64_t b = team.begin(plan.stencil_blocks); b < team.end(plan.stencil_blocks); ++b) {
       with_kind(plan.stencil_block[4 * b], [&](auto kind) {
         using Kind = decltype(kind);
@@ -122,14 +123,37 @@ struct Sweep {
           for (int first = 0; first < block_lanes; ++first) {
             const StencilPart<T> part{&plan, int(b), first};
             T number[Kind::numbers];
-            rows.read(plan.stencil_order[part.stencil()], plan.stencil_measure[part.stencil()],
-                      number);
-            for (int i = 0; i < Kind::numbers; ++i)
+            rows.read(plan.stencil_row[part.stencil()], measure<Kind>(part), number);
+            for (int i = 0; i < Kind::numbers - memory_of<Kind>; ++i)
               work.numbers[part.number(i) * lanes + lane] = number[i];
           }
         }
       });
     }
+  }
+
+  // V of a stencil; V / h where its energy dissipates.
+  template <class Kind>
+  T measure(const StencilPart<T>& part) const {
+    const T volume = plan.stencil_measure[part.stencil()];
+    return dissipates<Kind> ? volume * work.per_time : volume;
+  }
+
+  // The memory of all stencils, from the positions that `set_origins` took.
+  void begin_stencils() {
+    if (!plan.remembers) return;
+    for (int patch = team.begin(plan.patches); patch < team.end(plan.patches); ++patch) {
+      const int first = plan.patch_slot[patch], count = plan.patch_slot[patch + 1] - first;
+      for (int slot = 0; slot < count; ++slot) scratch.x[slot] = work.origin[first + slot];
+      stencils_of<1>(patch, StencilBegin{});
+    }
+  }
+
+  // A pass over the stencils of a patch that adds no force; the slots stand in the scratch.
+  template <int Fields, class Stencil>
+  void stencils_of(int patch, const Stencil& stencil) {
+    LaneSums<Lanes> unused;
+    each_work<Fields>(patch, unused, stencil);
   }
 
   // Positions relative to the first vertex of each patch keep their last bits however far from the origin.
@@ -173,11 +197,21 @@ struct Sweep {
       each_element(plan, patch, Tets(plan, corners, work.weights(), scratch.force, lanes),
                    element.solid);
     }
-    if (plan.stencil_blocks == 0) return;
+    if (plan.stencil_blocks) each_work<Fields>(patch, lanes, element.stencil);
+  }
+
+  template <int Fields, class Stencil>
+  void each_work(int patch, LaneSums<Lanes>& lanes, const Stencil& stencil) {
+    const Value* fields[Fields];
+    fields[0] = scratch.x;
+    if constexpr (Fields == 2) fields[1] = scratch.direction;
+    const auto& corners = const_cast<const Value* const(&)[Fields]>(fields);
     each_stencil<Lanes>(plan, patch, [&](auto kind, const StencilPart<T>& part) {
       using Kind = decltype(kind);
-      element.stencil.template run<Kind>(StencilsAcross<Kind, Fields, Lanes>{
-          part, corners, work.numbers, work.shared_weight, scratch.force, lanes});
+      // without a step nothing dissipates, and no memory is there
+      if (dissipates<Kind> && !(work.per_time > T(0))) return;
+      stencil.template run<Kind>(StencilsAcross<Kind, Fields, Lanes>{
+          part, corners, work.numbers, work.shared_numbers, scratch.force, lanes});
     });
   }
 

@@ -5,6 +5,7 @@
 #include "elements/lame.h"
 #include "solver/rigid/rolling_contact.h"
 
+#include <cmath>
 #include <cstdint>
 #include <memory>
 #include <new>
@@ -68,19 +69,20 @@ struct Workspace {
   T *weight, *pressure;
   T* numbers;  // the same of stencils: [rows of 16 numbers of a step]
   int part_count;
-  bool shared_weight;
+  bool shared_weight, shared_numbers;
+  T per_time;               // 1 / h of the step, or 0 where energies that dissipate do not count
   bool some_go_on = false;  // some environment moves in the next leg
 
   explicit Workspace(const StepCall<T>& call)
       : Workspace(call.plan, call.material, call.effects,
                   call.material.stiffness.stride == 0 && shares_effects(call.effects),
-                  call.forces != nullptr) {}
+                  call.forces != nullptr, T(1 / call.settings.time_step)) {}
 
   explicit Workspace(const FieldCall<T>& call)
-      : Workspace(call.plan, {}, call.effects, true, false) {}
+      : Workspace(call.plan, {}, call.effects, true, false, call.per_time) {}
 
   explicit Workspace(const ConjugateCall<T>& call)
-      : Workspace(call.plan, {}, call.effects, true, true) {}
+      : Workspace(call.plan, {}, call.effects, true, true, call.per_time) {}
 
   ElementWeights<T> weights() const { return {weight, pressure, shared_weight}; }
 
@@ -89,12 +91,14 @@ struct Workspace {
                   std::int64_t environment, std::int64_t e, std::int64_t at,
                   WeightKind kind) const {
     const T youngs = stiffness.of(environment)[plan.tet_order[e]], volume = plan.tet_volume[e];
-    const T bound = kind == WeightKind::majoriser ? plan.tet_bound[e] : T(1);
+    const T signed_bound = plan.tet_bound[e];
+    const T bound = kind == WeightKind::majoriser ? std::abs(signed_bound) : T(1);
     if (!pressure) {
       weight[at] = (volume * bound) * youngs;
       return;
     }
-    const Lame<T> lame(youngs, effects.poisson.of(environment)[plan.tet_order[e]]);
+    Lame<T> lame(youngs, effects.poisson.of(environment)[plan.tet_order[e]]);
+    if (signed_bound < 0 && kind != WeightKind::matrix) lame.lambda = 0;
     weight[at] = volume * (kind == WeightKind::majoriser ? lame.majoriser(bound)
                            : kind == WeightKind::matrix  ? lame.matrix()
                                                          : lame.twice_mu);
@@ -105,9 +109,11 @@ struct Workspace {
   static constexpr std::size_t alignment = 64;
 
   Workspace(const Plan<T>& plan, const Material<T>& material, const Effects<T>& effects,
-            bool same_stiffness, bool forces) {
+            bool same_stiffness, bool forces, T steps_per_time) {
     const bool has_pressure = effects.poisson.data != nullptr;
     shared_weight = Lanes::environments == 1 || same_stiffness;
+    shared_numbers = Lanes::environments == 1 || (same_stiffness && !plan.remembers);
+    per_time = steps_per_time;
     part_count = plan.patches + (plan.shared + shared_chunk - 1) / shared_chunk;
     arrange(plan, material, has_pressure, forces, nullptr);
     storage_ = allocate_zeroed(size_);
@@ -146,7 +152,7 @@ struct Workspace {
     if (!has_pressure) pressure = nullptr;
     place(numbers,
           std::int64_t(plan.stencil_numbers) * block_lanes *
-              (shared_weight ? 1 : Lanes::environments),
+              (shared_numbers ? 1 : Lanes::environments),
           base);
   }
 

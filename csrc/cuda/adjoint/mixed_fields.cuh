@@ -55,16 +55,16 @@ __global__ void __launch_bounds__(field_threads)
 template <class Kind, bool Product, int Fields, class T>
 __device__ void write_products(const MixedFieldWork<T>& work, const PatchFields<Fields, T>& fields,
                                const StencilPlace<T>& place) {
-  constexpr EffectsOf<Kind> effects;
+  constexpr ArraysOf<Kind> arrays;
   const DeviceStencils<T>& plan = work.stencils.plan;
   const T measure = plan.stencil_measure[place.stencil()];
   if (measure == T(0)) return;  // padding
   const int number = plan.stencil_order[place.stencil()];
   const MaterialRows<Kind, T> rows(work.effects.effects, fields.environment);
-  T g[gradient_numbers<Kind>], c[constant_slots<Kind>] = {}, row[Kind::rows];
+  T g[gradient_numbers<Kind>], c[constant_slots<Kind>] = {}, row[Kind::rows] = {};
   for (int i = 0; i < gradient_numbers<Kind>; ++i) g[i] = place.stored(i);
   for (int i = 0; i < Kind::constants; ++i) c[i] = place.stored(gradient_numbers<Kind> + i);
-  for (int i = 0; i < Kind::rows; ++i) row[i] = rows.row[i][number];
+  rows.values(number, row);
   Vec3<T> vectors[Kind::corners][Fields], x[Kind::corners], f[Kind::dims], df[Kind::dims] = {};
   for (int a = 0; a < Kind::corners; ++a) fields(place.corner(a), vectors[a]);
   for (int a = 0; a < Kind::corners; ++a) x[a] = vectors[a][0];
@@ -74,7 +74,7 @@ __device__ void write_products(const MixedFieldWork<T>& work, const PatchFields<
     deform<Kind>(x, g, df);
   }
   for (int i = 0; i < Kind::rows; ++i) {
-    T* const out = work.effects.products[effects.effect[i]];
+    T* const out = work.effects.products[arrays.effect[i]];
     if (!out) continue;
     const RowDerivative<Kind, T> by(i, row, measure, f, df, c);
     out[fields.environment * work.counts[kind_number<Kind>] + number] =
@@ -116,11 +116,11 @@ __global__ void __launch_bounds__(field_threads)
   std::int64_t first = tets;
   for (int kind = 0; kind < place.block.kind; ++kind) first += work.counts[kind];
   const int number = plan.stencil_order[place.stencil()];
-  with_kind(place.block.kind, [&](auto kind) {
+  with_gpu_kind(place.block.kind, [&](auto kind) {
     using Kind = decltype(kind);
     T numbers[Kind::numbers];
     MaterialRows<Kind, T>(work.effects.effects, environment).read(number, T(1), numbers);
-    out[first + number] = Kind::weight(numbers, T(1), T(1));
+    out[first + number] = rest_weight<Kind>(numbers);
   });
 }
 

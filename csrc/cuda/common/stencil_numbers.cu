@@ -17,7 +17,7 @@ __global__ void __launch_bounds__(number_threads)
   const std::int64_t environment = warp / work.plan.blocks;
   const StencilPlace<T> place(work.plan, int(warp % work.plan.blocks));
   T* const to = work.numbers_of(environment);
-  with_kind(place.block.kind, [&](auto kind) {
+  with_gpu_kind(place.block.kind, [&](auto kind) {
     using Kind = decltype(kind);
     T number[Kind::numbers];
     const MaterialRows<Kind, T> rows(effects, environment);

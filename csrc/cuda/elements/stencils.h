@@ -88,6 +88,14 @@ struct LaneStencil {
   }
 };
 
+// visit(Kind{}) for the kind of a number; a plan for a GPU has no other kinds
+template <class Visit>
+PD_DEVICE void with_gpu_kind(int number, const Visit& visit) {
+  with_kind(number, [&](auto kind) {
+    if constexpr (runs_on_gpu<decltype(kind)>) visit(kind);
+  });
+}
+
 // Calls visit(kind, place) for every block of a patch that this warp takes. `before`: blocks that warps have taken in
 // turn before these.
 template <class T, class Visit>
@@ -105,7 +113,7 @@ PD_DEVICE void each_stencil_block(const DeviceStencils<T>& plan, int patch, int 
     // in flight while this warp works on the present one
     const StencilBlock next = StencilPlace<T>::block_of(plan, min(number + warps, end - 1));
     const StencilPlace<T> place(plan, now, number);
-    with_kind(place.block.kind, [&](auto kind) { visit(kind, place); });
+    with_gpu_kind(place.block.kind, [&](auto kind) { visit(kind, place); });
     now = next;
   }
 }

@@ -32,7 +32,8 @@ void add_slots(MeshPlan& plan, const Numbering& n, const MeshElements& elements,
   }
   plan.patch_slot.push_back(std::int32_t(plan.slot_vertex.size()));
   if (plan.slot_vertex.size() - begin > std::numeric_limits<std::int16_t>::max())
-    throw std::invalid_argument("a patch has more vertices than 16 bits count: give a smaller patch_size");
+    throw std::invalid_argument(
+        "a patch has more vertices than 16 bits count: give a smaller patch_size");
 }
 
 // One lane of a block of tetrahedra.
@@ -44,7 +45,7 @@ void set_lane(MeshPlan& plan, std::size_t block, int lane, const MeshElements& e
   const auto face = face_rest<4>(x, {corner[0], corner[1], corner[2], corner[3]});
   plan.tet_order[block * lanes + lane] = t;
   plan.tet_volume[block * lanes + lane] = padding ? 0 : rest.volume;
-  plan.tet_bound[block * lanes + lane] = rest.bound;
+  plan.tet_bound[block * lanes + lane] = elements.averaged.has_trace(t) ? rest.bound : -rest.bound;
   for (int n = 0; n < 6; ++n) plan.tet_rest[(block * 6 + n) * lanes + lane] = face[n];
   for (int k = 0; k < 4; ++k)
     plan.tet_corner[(block * 4 + k) * lanes + lane] = std::int16_t(slot_of[corner[k]]);
@@ -93,6 +94,7 @@ void add_stencils(MeshPlan& plan, const StencilGroup& group, std::span<const std
       const std::int64_t i = lane * blocks + b;
       const std::int64_t s = patch[std::min(i, count - 1)] - first;
       plan.stencil_order.push_back(std::int32_t(s));
+      plan.stencil_row.push_back(std::int32_t(group.row ? group.row[s] : s));
       plan.stencil_measure.push_back(i < count ? group.measure[s] : 0);
       plan.stencil_bound.push_back(stencil_bound(group, s));
       for (int c = 0; c < group.corners; ++c) {
@@ -133,8 +135,7 @@ MeshPlan build_plan(const MeshElements& elements, int patch_size,
                     const std::function<void(double)>& progress) {
   // tetrahedra and stencils
   const std::int64_t single = elements.tet_count + elements.count() - elements.solids();
-  const Partition mesh =
-      partition_mesh(elements, (single + patch_size - 1) / patch_size, lanes);
+  const Partition mesh = partition_mesh(elements, (single + patch_size - 1) / patch_size, lanes);
   progress(0.3);
 
   Numbering numbering = number_vertices(mesh, elements);

@@ -15,7 +15,7 @@ struct MeshPlan {
       slot_vertex, shared_start, shared_slot;
   std::vector<double> tet_rest, tet_volume, tet_bound;
   std::vector<std::int16_t> tet_corner;
-  std::vector<std::int32_t> stencil_block, patch_stencil, stencil_order;
+  std::vector<std::int32_t> stencil_block, patch_stencil, stencil_order, stencil_row;
   std::vector<double> stencil_measure, stencil_bound, stencil_stored;
   std::vector<std::int16_t> stencil_corner;
   std::int32_t stencil_numbers = 0;  // rows of 16 numbers of a step

@@ -25,12 +25,18 @@ TetGroups groups_of(const std::int64_t* group, const std::int64_t* tets, std::in
   std::unordered_map<std::int64_t, std::int64_t> place;  // of each group, by first appearance
   std::vector<std::int64_t> size, number(count);
   for (std::int64_t t = 0; t < count; ++t) {
+    if (group[t] < 0) {
+      number[t] = std::ssize(size);
+      size.push_back(1);
+      continue;
+    }
     const auto [found, is_new] = place.try_emplace(group[t], std::ssize(size));
     if (is_new) size.push_back(0);
     number[t] = found->second;
     check_size(group[t], ++size[found->second]);
   }
   TetGroups groups;
+  for (std::int64_t t = 0; t < count; ++t) groups.traceless.push_back(group[t] < 0);
   groups.tets.resize(count);
   groups.corners.resize(4 * count);
   groups.start.resize(size.size() + 1);

@@ -16,20 +16,23 @@ struct StencilGroup {
   const double* gradient = nullptr;      // [count, corners, dims] g_a
   const double* measure = nullptr;       // [count] V
   const double* constant = nullptr;      // [count, constants]
+  const std::int64_t* row = nullptr;     // [count] of the material; null: their own numbers
 };
 
 // Tetrahedra in groups that average their trace, see elements/corotated.h: a partition never cuts one.
 struct TetGroups {
   std::vector<std::int32_t> tets;     // user's numbers, group by group, ascending in each
   std::vector<std::int64_t> corners;  // [4 tets] in that order
-  std::vector<std::int64_t> start;    // first of each group, and the end; empty: each tetrahedron alone
-  int members = 1;                    // places of every group: 1, 2 or 4; smaller ones are filled up
+  std::vector<std::int64_t> start;    // first of each group, and the end; empty: each alone
+  int members = 1;                   // places of every group: 1, 2 or 4; smaller ones are filled up
+  std::vector<bool> traceless = {};  // [tets] whether a stencil has its volume energy
 
   bool is_empty() const { return start.empty(); }
   std::int64_t count() const { return std::ssize(start) - 1; }
+  bool has_trace(std::int64_t tet) const { return is_empty() || !traceless[tet]; }
 };
 
-// From the number of each tetrahedron's group [count]. Groups are in the order of their first tetrahedra. Throws
+// From the number of each tetrahedron's group [count]; without a trace term where it is negative. Groups are in the order of their first tetrahedra. Throws
 // std::invalid_argument for more than four in one.
 TetGroups groups_of(const std::int64_t* group, const std::int64_t* tets, std::int64_t count);
 
