@@ -206,7 +206,7 @@ def reactions(scene: Scene, call: AdjointCall, about: Tensor | None) -> Reaction
     ties: dict[Tie, TieForce] = {}
     for tie, own in forces_of_ties(scene, call.after, material).items():
         body = bodies[tie.body]
-        ties[tie] = TieForce(own, _wrench(own, body.positions[:, tie.vertices], body.about))
+        ties[tie] = TieForce(own, _wrench(own, body.positions[:, tie.vertices.tolist()], body.about))
     return Reactions(forces, on_vertices, pins, ties)
 
 
