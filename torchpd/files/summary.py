@@ -157,8 +157,8 @@ def _sizes_of(bodies: Sequence[Body], words: Mapping[str, str]) -> str:
     """Numbers of stencils of some bodies by kind, in words."""
     counts = dict.fromkeys(words, 0)
     for group in (group for body in bodies for group in body.stencils(lambda body: 0)):
-        counts[group.kind] += len(group)
-    return ", ".join(f"{count} {words[kind]}" for kind, count in counts.items() if count)
+        counts[group.kind] = counts.get(group.kind, 0) + len(group)
+    return ", ".join(f"{count} {words.get(kind, kind)}" for kind, count in counts.items() if count)
 
 
 def _pin_lines(sim: Stepper) -> list[str]:
