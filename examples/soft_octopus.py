@@ -14,7 +14,7 @@ import torchpd as tpd
 from torchpd.viewing.bodies import SceneSurface
 from torchpd.viewing.render import frame_camera, render
 
-RADIUS, PRESS = 0.12, 0.14  # of the balls, and how far they go down [m]
+RADIUS, PRESS = 0.12, 0.11  # of the balls, and how far they go down [m]
 
 
 def main() -> None:
