@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
+from PIL import Image
 
 import torchpd as tpd
 from torchpd.viewing.animation import write_surface
+from torchpd.viewing.render import CORAL, render
 
 TIME_STEP = 1 / 60  # s
 SIZE = (1.5, 1.0)  # m, along the wind and up
@@ -35,9 +38,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=240, help="of 1/60 s")
     parser.add_argument("--cells", type=int, default=12, help="cells along the pole")
     parser.add_argument("--speed", type=float, default=6.0, help="mean speed of the wind [m/s]")
-    parser.add_argument("--out", type=Path, default=Path("flag.glb"), help="motion (.glb, .usdc)")
+    parser.add_argument("--out", type=Path, default=Path("flag.glb"), help="motion (.glb, .usdc), or end (.png)")
     options = parser.parse_args()
-
     surface = sheet(options.cells)
     flag = tpd.Cloth(surface, youngs=5e6, thickness=2e-4, area_density=0.15, bending=1e-5)
     pole = tpd.Pin(flag, surface.vertices[:, 0] == 0.0)
@@ -59,11 +61,17 @@ def main() -> None:
     every = max(options.steps // 8, 1)
     for step in range(every - 1, options.steps, every):
         before = track.state(step - 1) if step else start
-        pull = -sim.reactions(before, track.state(step), targets=gusts(step)).pins[pole].wrench.force[0]
-        x, y, z = track.positions[step, 0, edge].mean(0).tolist()
-        speed = float(gusts(step)[wind].norm())
-        print(f"{(step + 1) * TIME_STEP:10.2f} {speed:12.1f} {x:12.2f}, {y:5.2f}, {z:5.2f} {float(pull.norm()):22.2f}")
-    write_surface(options.out, track.positions[:, 0], surface.triangles, frames_per_second=1.0 / TIME_STEP)
+        pull = float(sim.reactions(before, track.state(step), targets=gusts(step)).pins[pole].wrench.force.norm())
+        place = "{:12.2f}, {:5.2f}, {:5.2f}".format(*track.positions[step, 0, edge].mean(0).tolist())
+        print(f"{(step + 1) * TIME_STEP:10.2f} {float(gusts(step)[wind].norm()):12.1f} {place} {pull:22.2f}")
+    if options.out.suffix == ".png":
+        mast = trimesh.creation.cylinder(0.02, segment=[(-0.02, -0.8, 0.0), (-0.02, 1.1, 0.0)])
+        both = trimesh.Trimesh(track.positions[-1, 0], surface.triangles, process=False) + mast
+        colors = np.repeat([CORAL, (0.30, 0.31, 0.33)], [len(surface.vertices), len(mast.vertices)], axis=0)
+        image = render(both.vertices, both.faces, color=colors, ground=-0.8, size=(640, 480), samples=64)
+        Image.fromarray(image).save(options.out)
+    else:
+        write_surface(options.out, track.positions[:, 0], surface.triangles, frames_per_second=1.0 / TIME_STEP)
     print(f"written: {options.out}")
 
 

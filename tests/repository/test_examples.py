@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import runpy
@@ -15,6 +16,7 @@ from PIL import Image
 from programs import ROOT
 
 import torchpd
+from torchpd.viewing import render as viewing
 
 EXAMPLES = ROOT / "examples"
 
@@ -30,6 +32,13 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
         return capsys.readouterr().out
 
     return run
+
+
+@pytest.fixture
+def pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Examples render small, noisy pictures."""
+    full = viewing.render
+    monkeypatch.setattr(viewing, "render", lambda *a, **more: full(*a, **{**more, "size": (48, 36), "samples": 1}))
 
 
 def numbers(text: str, pattern: str) -> list[float]:
@@ -108,6 +117,46 @@ def test_flag(run, tmp_path: Path) -> None:
     assert sides[0][-1] > 0.1  # the first gust blows to that side
     assert not any(sides[1])  # it falls in its plane
     assert float(blown[-1][2]) > float(calm[-1][2])  # the wind pulls at the pole
+
+
+@pytest.mark.usefixtures("pictures")
+def test_flag_as_a_picture(run) -> None:
+    run("flag.py", "--steps", "2", "--cells", "2", "--out", "flag.png")
+    assert Image.open("flag.png").size == (48, 36)
+
+
+@pytest.mark.usefixtures("pictures")
+def test_drape(run) -> None:
+    text = run("drape.py", "--edge", "0.08", "--steps", "90", "--out", "drape.png")
+    weight, carried = numbers(text, r"weight (\S+) N, of which the ball carries (\S+) N")
+    panel = 0.55 * (1.1 - 0.3 * 0.55)  # m^2: the sides are shorter by the fall of the shoulders
+    assert weight == pytest.approx(0.3 * 9.81 * (2 * panel - math.pi * 0.12**2), rel=0.01)
+    assert carried == pytest.approx(weight, rel=0.02)  # it almost rests
+    flat, worn = numbers(text, r"(\S+) % flat, (\S+) % on the ball")
+    # to lie flat, the sides are stretched to the length of the middle, by 40 %
+    assert flat > 5.0
+    assert worn < 0.1 * flat  # on the ball it has the shape of its pattern
+    assert Image.open("drape.png").size == (48, 36)
+
+
+@pytest.mark.usefixtures("pictures")
+def test_soft_octopus(run) -> None:
+    text = run("soft_octopus.py", "--cells", "8", "--steps", "12", "--out", "octopus.png")
+    kept = [float(share) for share in re.findall(r"(\S+) % of the volume is left", text)]
+    assert 70.0 < kept[0] < 90.0
+    assert kept[1] < 100.0
+    assert 100.0 - kept[1] < 0.5 * (100.0 - kept[0])
+    assert Image.open("octopus.png").size == (48, 36)
+
+
+@pytest.mark.usefixtures("pictures")
+def test_muscle(run) -> None:
+    text = run("muscle.py", "--steps", "12", "--tries", "5", "--out", "muscle.png")
+    missed = [float(row) for row in re.findall(r"^ +\d+ .* (\S+)$", text, flags=re.MULTILINE)]
+    assert len(missed) == 5
+    assert missed[0] > 100.0
+    assert missed[-1] < 0.01  # Newton's method: exact gradients double the digits
+    assert Image.open("muscle.png").size == (48, 36)
 
 
 def test_push_to_goal(run) -> None:

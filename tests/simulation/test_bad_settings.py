@@ -98,7 +98,7 @@ def test_arguments_of_a_step_are_checked(sim: pd.Simulator) -> None:
         (torch.zeros(2, 3), ValueError, r"targets .*got \[2, 3\]"),
         (torch.zeros(5, 3, 3), ValueError, r"targets .*got \[5, 3, 3\]"),
         (torch.zeros(3, 3).double(), TypeError, r"targets .*got torch\.float64 on cpu"),
-        ({pin: torch.zeros(1, 3)}, ValueError, r"targets of a Pin must be \[2, 3\]"),
+        ({pin: torch.zeros(1, 3)}, ValueError, r"targets of a Pin must be \[2, 3\].*pin_range"),
         ({soft: torch.zeros(3)}, ValueError, r"targets of a Pin must be \[1, 3\]"),
         ({sphere: torch.zeros(4)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\]"),
         ({sphere: torch.tensor(0.0)}, ValueError, r"targets of a Sphere must be \[3\] or \[6\], .* got \[\]"),

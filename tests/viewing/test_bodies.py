@@ -66,6 +66,8 @@ def test_all_bodies_of_a_scene() -> None:
     assert np.array_equal(own[0], sheet.surface.vertices)
     np.testing.assert_allclose(own[1], outer.vertices, atol=1e-12)
     assert np.array_equal(own[3], mesh.vertices)
+    colors = [np.unique(part, axis=0) for part in np.split(skin.colors, np.cumsum(counts)[:-1])]
+    assert np.unique(np.concatenate(colors), axis=0).shape == (4, 3)  # one for each body
     sizes = [len(sheet.surface.triangles), 1, 2 * SIDES * 2 + 2 * (SIDES - 2), len(mesh.boundary())]
     assert len(skin.triangles) == sum(sizes)
     assert skin.triangles.max() == sum(counts) - 1

@@ -79,6 +79,20 @@ def test_picture_shows_light_shadow_and_colour_and_repeats() -> None:
     assert np.array_equal(image, studio.render(vertices))
 
 
+def test_every_vertex_may_have_its_colour() -> None:
+    """The left box is red, the right one blue, although their vertices are split at creases."""
+    left, right = (trimesh.creation.box().apply_translation((x, 0.5, 0.0)) for x in (-0.7, 0.7))
+    points, both = np.concatenate([left.vertices, right.vertices]), np.concatenate([left.faces, right.faces + 8])
+    color = np.repeat([(0.8, 0.05, 0.05), (0.05, 0.05, 0.8)], 8, axis=0)
+    camera = frame_camera(points, azimuth=0.0)
+    image = render(points, both, color=color, camera=camera, size=(64, 48), samples=4).astype(int)
+    more_red = image[..., 0] - image[..., 2]
+    assert more_red[24, 20] > 60
+    assert more_red[24, 44] < -60
+    with pytest.raises(ValueError, match=r"color.*\[7, 3\]"):
+        Studio(points, both, color=color[:7])
+
+
 def test_floor_lies_below_the_lowest_vertex_of_all_frames() -> None:
     vertices, triangles = _ball((0.0, 0.5, 0.0), 0.5)
     assert Studio([vertices, vertices - [0.0, 0.25, 0.0]], triangles, ground=None).ground == pytest.approx(-0.25)

@@ -18,6 +18,7 @@ __all__ = ["Anchors", "Targets"]
 Array = NDArray[np.float64]
 Targets = Tensor | Mapping[Any, Tensor]
 _LASTING = slice(SPHERES["center"].stop, SPHERES["motion"].start)  # radius and friction
+_OWN_ROWS = "; sim.pin_targets has the rows of all pins, and scene.pin_range(pin) says which are its own"
 
 
 def _overwrite(array: Tensor, rows: slice, value: Tensor, axis: int) -> Tensor:
@@ -93,7 +94,8 @@ class Anchors:
             if id(part) in self.pins:
                 name, rows = "pin_targets", self.pins[id(part)]
                 shapes = [(rows.stop - rows.start, 3)]
-                value = self._checked("targets of a Pin", value, batch, shapes, material[name], fix)
+                own = f"{_OWN_ROWS}{fix}"
+                value = self._checked("targets of a Pin", value, batch, shapes, material[name], own)
             elif id(part) in self.spheres:
                 name, number = "spheres", self.spheres[id(part)]
                 rows = slice(number, number + 1)

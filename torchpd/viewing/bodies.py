@@ -13,6 +13,7 @@ from ..scene.effects import Solid
 from ..scene.part import Body
 from ..scene.rod import Rod
 from ..scene.scene import Scene
+from .render import CORAL
 
 __all__ = ["SceneSurface"]
 
@@ -21,6 +22,10 @@ Index = NDArray[np.int64]
 
 # a direction shorter than this share of a unit vector has turned around: any normal serves
 _SHORTEST = 1e-6
+# linear RGB of the bodies in turn: coral, blue, ochre, green, violet, grey
+_COLORS = np.array(
+    [CORAL, (0.04, 0.16, 0.42), (0.60, 0.30, 0.03), (0.05, 0.28, 0.16), (0.22, 0.08, 0.36), (0.30, 0.31, 0.33)]
+)
 
 
 class SceneSurface:
@@ -38,6 +43,7 @@ class SceneSurface:
 
     Attributes:
         triangles: [T, 3] into the vertices that `apply` returns.
+        colors: [n, 3] linear RGB of these vertices, another one for each body, for `Studio(color=)`.
     """
 
     def __init__(self, scene: Scene, *, sides: int = 8) -> None:
@@ -45,11 +51,12 @@ class SceneSurface:
         self._places = {body: scene.vertex_range(body) for body in scene.bodies}
         self._count = sum(len(body.mesh.vertices) for body in scene.bodies)
         parts: list[Index] = []
-        start = 0
+        counts: list[int] = []
         for body, place in self._places.items():
-            parts.append(self._triangles(body) + start)
-            start += self._drawn(body, scene.rest_positions[None, place]).shape[1]
+            parts.append(self._triangles(body) + sum(counts))
+            counts.append(self._drawn(body, scene.rest_positions[None, place]).shape[1])
         self.triangles: Index = np.concatenate(parts)
+        self.colors: Array = np.repeat(_COLORS[np.arange(len(counts)) % len(_COLORS)], counts, axis=0)
 
     def apply(self, positions: Any) -> Array:
         """Vertices of the surface [..., n, 3] m for positions of the scene [..., V, 3]."""

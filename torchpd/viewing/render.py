@@ -136,7 +136,7 @@ class Studio:
         triangles: [m, 3] vertex numbers.
         ground: height of the floor [m]; None puts it below the lowest vertex of all frames.
         camera: None frames the whole motion.
-        color: reflectance of the surface.
+        color: reflectance of the surface, [3] or one for each vertex [n, 3].
         size: width and height of the pictures [pixels].
         samples: light paths per pixel, rounded up to a square; a denoiser removes the remaining noise.
     """
@@ -148,7 +148,7 @@ class Studio:
         *,
         ground: float | None = 0.0,
         camera: Camera | None = None,
-        color: Color = CORAL,
+        color: Color | Array = CORAL,
         size: tuple[int, int] = (480, 360),
         samples: int = 9,
     ) -> None:
@@ -162,7 +162,12 @@ class Studio:
             raise ValueError(f"size and samples must be at least 1, got {size} and {samples}")
         self.surface = SmoothSurface(motion[0], triangles)
         self._count = motion.shape[1]
-        self.size, self.samples, self.color = size, samples, color
+        self.size, self.samples = size, samples
+        colors = as_array("color", color, np.float64)
+        if colors.ndim == 1:
+            colors = np.broadcast_to(colors, (self._count, 3)) if colors.shape == (3,) else colors
+        check_shape("color", colors, (self._count, 3), "linear RGB of the surface [3] or of each vertex")
+        self.color = colors[self.surface.source]
         self.low, self.high = motion.min(axis=(0, 1)), motion.max(axis=(0, 1))
         self.ground = float(self.low[1]) if ground is None else check_scalar("ground", ground)
         self.camera = camera or frame_camera(motion, aspect=size[0] / size[1])
@@ -193,14 +198,15 @@ class Studio:
         hung = mi.ScalarTransform4f().look_at(origin=soft_box.tolist(), target=middle.tolist(), up=[0, 1, 0])
         material = {
             "type": "principled",
-            "base_color": _rgb(self.color),
+            "base_color": {"type": "mesh_attribute", "name": "vertex_color"},
             "roughness": 0.32,
             "specular": 0.5,
             "clearcoat": 0.5,
             "clearcoat_gloss": 0.85,
         }
         # two-sided, because an open surface shows both sides
-        body = _mesh(mi, positions, self.surface.triangles, normals, bsdf={"type": "twosided", "material": material})
+        bsdf = {"type": "twosided", "material": material}
+        body = _mesh(mi, positions, self.surface.triangles, normals, self.color, bsdf)
         return {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": 4},
@@ -307,11 +313,12 @@ def _to_srgb(radiance: Radiance) -> Picture:
     return (255.0 * encoded + 0.5).astype(np.uint8)
 
 
-def _mesh(mi: Any, positions: Array, triangles: Index, normals: Array, bsdf: dict[str, Any]) -> Any:
-    """A Mitsuba mesh with smooth normals."""
+def _mesh(mi: Any, positions: Array, triangles: Index, normals: Array, colors: Array, bsdf: dict[str, Any]) -> Any:
+    """A Mitsuba mesh with smooth normals and a colour for each vertex."""
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
     mesh = mi.Mesh("body", len(positions), len(triangles), has_vertex_normals=True, props=properties)
+    mesh.add_attribute("vertex_color", 3, colors.astype(np.float32).ravel())
     buffers = mi.traverse(mesh)
     buffers["vertex_positions"] = positions.astype(np.float32).ravel()
     buffers["vertex_normals"] = normals.astype(np.float32).ravel()
