@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import fields
 from typing import Any
 
@@ -10,6 +11,7 @@ from torch import Tensor
 
 __all__ = ["by_fields", "by_sizes"]
 
+_NONE = object()  # no default
 _FEW = 6  # numbers of an array that are printed
 
 
@@ -32,9 +34,22 @@ def by_sizes(value: object, tensor: Any, *names: str, trailing: int = 1, more: s
 
 
 def by_fields(value: Any) -> str:
-    """`Ground(height=0.0, normal=[0.0, 1.0, 0.0], friction=0.5)`: a dataclass, long arrays by precision and shape."""
-    words = (f"{field.name}={_in_short(getattr(value, field.name))}" for field in fields(value))
+    """`Ground(height=0.0, normal=[0.0, 1.0, 0.0], friction=0.5)`: a dataclass, long arrays by precision and shape.
+
+    Keyword-only arguments at their defaults are left out.
+    """
+    usual = {
+        name: argument.default
+        for name, argument in inspect.signature(type(value)).parameters.items()
+        if argument.kind is argument.KEYWORD_ONLY
+    }
+    own = {field.name: getattr(value, field.name) for field in fields(value)}
+    words = [f"{name}={_in_short(item)}" for name, item in own.items() if not _is_usual(item, usual.get(name, _NONE))]
     return f"{type(value).__name__}({', '.join(words)})"
+
+
+def _is_usual(item: object, default: object) -> bool:
+    return item is default or (isinstance(item, (str, float)) and isinstance(default, type(item)) and item == default)
 
 
 def _in_short(value: object) -> str:
