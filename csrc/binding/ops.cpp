@@ -28,6 +28,7 @@ struct Cpu {
   static Plan<T> plan_view(at::TensorList arrays, const Place& place) {
     return pd::plan_view<T>(arrays, place);
   }
+  static constexpr bool sums_tets = true;
   template <class Call>
   static void view_stencils(Call&, at::TensorList, const Place&) {}  // the plan has them
   template <class Call>

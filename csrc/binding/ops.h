@@ -2,7 +2,8 @@
 //
 // A Backend has `Plan<T>`, the plan that its kernels read, and `plan_view<T>(arrays, place)`. `Step<T>`, `Field<T>` and
 // `Conjugate<T>` are its calls with effects; `view_stencils(call, arrays, place)` adds the stencils of the plan to one,
-// and `stencil_counts(call)` is their number of each kind, null without any. Its functions `step`, `report`, `field`,
+// and `stencil_counts(call)` is their number of each kind, null without any. `sums_tets`: whether Field::effect_energy
+// counts tetrahedra. Its functions `step`, `report`, `field`,
 // `precondition`, `conjugate` and `rotation` run a call on the device of the tensor they are given.
 #pragma once
 #include "binding/checks.h"
@@ -221,7 +222,8 @@ Tensor effect_energy(const Tensor& positions, at::TensorList material, at::Tenso
   } else {
     field_typed<Backend, double>(Field::effect_energy, positions, {}, material, plan, out);
   }
-  return out;
+  if constexpr (Backend::sums_tets) return out;
+  return out + run_field<Backend>(Field::element_energy, positions, {}, material, plan).sum(-1);
 }
 
 // The place of Poisson's ratio in stencil_products.

@@ -27,6 +27,7 @@ struct Cuda {
   template <class T>
   using Conjugate = Mixed<DeviceConjugate<T>>;
 
+  static constexpr bool sums_tets = false;
   template <class Call>
   static void view_stencils(Mixed<Call>& call, at::TensorList arrays, const Place& place) {
     call.stencils = device_stencils_view<typename Call::real>(arrays, call.plan.patches, place);
