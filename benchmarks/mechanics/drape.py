@@ -1,7 +1,8 @@
 """The drape test of Cusick: a disc of cloth of 30 cm hangs over a support of 18 cm.
 
-Vertices within 9 cm are held, which is the support with its upper disc. The drape coefficient is the share of the ring's
-area that the shadow of the hanging cloth covers (Cusick 1968, J. Textile Inst. 59, 253). Cloth passes through itself.
+Vertices within 9 cm are held, which is the support with its upper disc. The drape coefficient is the share of the
+ring beyond it that the shadow of the hanging cloth covers (Cusick 1968, J. Textile Inst. 59, 253). The cloth passes
+through itself, and has no friction between its yarns.
 """
 
 from __future__ import annotations
