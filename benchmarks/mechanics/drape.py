@@ -7,7 +7,7 @@ through itself, and has no friction between its yarns.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -74,14 +74,20 @@ def _cloth(fabric: Fabric, mesh: tpd.TriMesh) -> tpd.Cloth:
     )
 
 
-def hang(fabric: Fabric, edge: float, *, seconds: float = 3.0) -> tuple[tpd.TriMesh, Array]:
-    """The mesh, and where it hangs at rest [V, 3]: steps of 1/60 s, then the equilibrium near them."""
+def hang(fabric: Fabric, edge: float, *, waves: int = 0, seconds: float = 3.0) -> tuple[tpd.TriMesh, Array]:
+    """The mesh, and where it hangs at rest [V, 3]: steps of 1/60 s, then the equilibrium near them.
+
+    With `waves`, the free cloth starts with velocities of 0.3 m/s up and down, that many times around.
+    """
     mesh = disc(RADIUS, SUPPORT, edge)
     body = _cloth(fabric, mesh)
     held = np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 2]) < SUPPORT + 1e-9
     parts = (body, tpd.Pin(body, held), tpd.Gravity((0.0, -9.81, 0.0)))
     sim = tpd.Simulator(tpd.Scene(*parts), 1.0 / 60.0, 200, "chebyshev", torch.float64)
     state = sim.rest_state()
+    if waves:
+        around = np.arctan2(mesh.vertices[:, 2], mesh.vertices[:, 0])
+        state.velocities[0, :, 1] = torch.from_numpy(0.3 * np.cos(waves * around) * ~held)
     for _ in range(round(60.0 * seconds)):
         state = sim(state)
     found = equilibrium(*parts, start=state.positions[0].numpy(), tolerance=1e-9)
@@ -104,18 +110,23 @@ def shadow(points: Array, triangles: Array, cell: float) -> float:
     return float(covered.sum()) * cell**2
 
 
-def drape_coefficient(fabric: Fabric, edge: float, *, seconds: float = 3.0) -> float:
+def drape_coefficient(fabric: Fabric, edge: float, *, waves: int = 0, seconds: float = 3.0) -> float:
     """Share of the ring beyond the support that the shadow covers."""
-    mesh, positions = hang(fabric, edge, seconds=seconds)
+    mesh, positions = hang(fabric, edge, waves=waves, seconds=seconds)
     flat, hanging = (shadow(at[:, [0, 2]], mesh.triangles, 5e-4) for at in (mesh.vertices, positions))
     held = np.pi * SUPPORT**2
     return (hanging - held) / (flat - held)
 
 
 def cases() -> list[Case]:
+    wool, cotton = FABRICS[2], FABRICS[5]
+    stiffer = replace(cotton, bending=(2.0 * cotton.bending[0], 2.0 * cotton.bending[1]))
+    given = [(fabric.name, fabric, 0) for fabric in FABRICS]
+    given += [(f"{wool.name}; starts with six waves", wool, 6), (f"{cotton.name}; twice its bending", stiffer, 0)]
     return [
-        Case("Drape", fabric.name, f"edges of {1e3 * edge:g} mm", fabric.source, fabric.measured,
-             partial(drape_coefficient, fabric, edge), 0.125 if fabric.published else None, published=fabric.published)
-        for fabric in FABRICS
+        Case("Drape", name, f"edges of {1e3 * edge:g} mm", fabric.source, fabric.measured,
+             partial(drape_coefficient, fabric, edge, waves=waves), 0.125 if fabric.published else None,
+             published=fabric.published)
+        for name, fabric, waves in given
         for edge in (0.01, 0.005)
     ]  # fmt: skip

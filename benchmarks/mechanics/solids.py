@@ -171,7 +171,8 @@ def _cantilevers() -> list[Case]:
     table, source = "Cantilever", "Timoshenko, k of Cowper"
     found = [
         Case(table, "20 x 4 x 4, quadratic", f"nu = {nu:g}", source, 1.0,
-             partial(lambda nu: quadratic.sag(_bar(4), YOUNGS, nu, 10.0) / timoshenko(nu, 10.0), nu), 0.02)
+             partial(lambda nu: quadratic.sag(_bar(4), YOUNGS, nu, 10.0) / timoshenko(nu, 10.0), nu),
+             None if nu else 1e-3)  # with nu the clamp, which keeps its section from contracting, is not Timoshenko's
         for nu in RATIOS
     ]  # fmt: skip
     lattice = partial(tpd.tetrahedralize, _block(), cells=20)
