@@ -145,9 +145,9 @@ def _exact_cases() -> list[Case]:
     found = [
         Case("Exact cases", f"patch test, solid, nu = {nu:g}, averaging {groups}", "distance of inner vertices [m]",
              "affine map", 0.0, partial(patch, nu, groups), 1e-10, quick=groups != 2)
-        for nu, groups in ((0.0, 1), (0.3, 1), (0.3, 4), (0.45, 1), (0.45, 2), (0.45, 4))
+        for nu, groups in ((-0.3, 4), (0.0, 1), (0.3, 1), (0.3, 4), (0.45, 1), (0.45, 2), (0.45, 4))
     ]  # fmt: skip
-    for nu, groups, stretch in ((0.3, 1, 1.3), (0.45, 4, 1.2), (0.45, 4, 0.8)):
+    for nu, groups, stretch in ((0.3, 1, 1.3), (0.45, 4, 1.2), (0.45, 4, 0.8), (-0.3, 1, 1.2)):
         row = f"bar, nu = {nu:g}, averaging {groups}, stretch s = {stretch:g}"
         found += [
             Case("Exact cases", row, "lateral stretch", "1 - nu (s - 1)", 1.0 - nu * (stretch - 1.0),
