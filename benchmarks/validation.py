@@ -78,7 +78,7 @@ def listed(rows: list[Record]) -> list[list[str]]:
     lines = [
         [
             row["row"], row["column"], row["source"], f"{row['expected']:.6g}",
-            f"{row['found']:.6g}" if abs(row["found"]) > 1e-12 else "0", error_text(row),
+            f"{row['found']:.6g}" if abs(row["found"]) >= 1e-9 else "0", error_text(row),
         ]
         for row in rows
     ]  # fmt: skip
