@@ -95,7 +95,7 @@ def elastica(load: float, length: float = 1.0) -> tuple[float, float]:
 
 
 def large_sag(kind: str, cells: int, load: float) -> float:
-    """Sag of a strip over that of the elastica, both with L from half a cell before the first free hinge."""
+    """Sag of a strip over that of the elastica, both with L from halfway between the held rows."""
     mesh, start = strip(kind, 1.0, 0.2, cells), None
     for part in np.linspace(0.25, 1.0, 4):
         found = _hang(mesh, part * load, start)
@@ -187,9 +187,9 @@ def _strips() -> list[Case]:
         for cells in (10, 20, 40):
             row, quick = f"{kind}, {cells} cells", cells == 10
             found += [
-                Case("Cantilever strip", row, "L from the first free row", "q L^4 / 8 kb", 1.0,
+                Case("Cantilever strip", row, "L from the last held row", "q L^4 / 8 kb", 1.0,
                      partial(small_sag, kind, cells, 0.0), None, quick=quick),
-                Case("Cantilever strip", row, "L from half a cell before", "q L^4 / 8 kb", 1.0,
+                Case("Cantilever strip", row, "L from half a cell before it", "q L^4 / 8 kb", 1.0,
                      partial(small_sag, kind, cells, 0.5), 0.25, quick=quick),
             ]  # fmt: skip
             if cells == 20:
