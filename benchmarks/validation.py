@@ -4,7 +4,7 @@ Every case is a row of data: what is compared, with what, and what torchpd gives
 energy and forces of the compiled ops, minimised to rounding, so that no time step and no solver enters.
 
     python benchmarks/validation.py --out benchmarks/results/validation.json      # minutes; prints the tables
-    python benchmarks/validation.py --only Torsion --out ...                      # those rows anew
+    python benchmarks/validation.py --only Torsion --out ...                      # rows with this in a label, anew
     python benchmarks/validation.py --page benchmarks/results/validation.json     # the tables of a file
 """
 
@@ -49,20 +49,19 @@ def run_case(case: Case) -> Record:
     }
 
 
-def key_of(row: Record) -> tuple[str, str, str]:
-    return row["table"], row["row"], row["column"]
+def key_of(row: Record) -> str:
+    return f"{row['table']} / {row['row']} / {row['column']}"
 
 
 def chosen(options: argparse.Namespace) -> list[Case]:
-    own = [case for case in CASES if not options.only or case.table in options.only]
+    own = [case for case in CASES if not options.only or any(words in case.key for words in options.only)]
     return [case for case in own if case.quick] if options.quick else own
 
 
 def ordered(rows: list[Record]) -> list[Record]:
     """In the order of the cases; rows of cases that no longer exist are left out."""
     by_key = {key_of(row): row for row in rows}
-    keys = [(case.table, case.row, case.column) for case in CASES]
-    return [by_key[key] for key in keys if key in by_key]
+    return [by_key[case.key] for case in CASES if case.key in by_key]
 
 
 def error_text(row: Record) -> str:
@@ -116,10 +115,12 @@ def tables(rows: list[Record]) -> dict[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="a few seconds: the smallest meshes of each table")
-    parser.add_argument("--only", nargs="+", choices=TABLES, metavar="TABLE", help=f"of {', '.join(TABLES)}")
+    parser.add_argument("--only", nargs="+", help="cases with one of these words in table, row or column")
     parser.add_argument("--page", type=Path, help="print the tables of this file and end")
     parser.add_argument("--out", type=Path, help="output file (JSON); its other rows are kept")
     options = parser.parse_args()
+    if not chosen(options):
+        parser.error(f"--only must name cases of {', '.join(TABLES)}, got {' '.join(options.only)}")
     if options.page:
         rows = json.loads(options.page.read_text())["rows"]
     else:
@@ -132,7 +133,7 @@ def main() -> None:
             write_result(options.out, {"schema": 1, **now, "rows": rows})
     for title, table in tables(rows).items():
         print(f"\n## {title}\n\n{table}")
-    wrong = [" / ".join(key_of(row)) for row in rows if not row["holds"]]
+    wrong = [key_of(row) for row in rows if not row["holds"]]
     if wrong:
         raise SystemExit(f"errors beyond their bounds: {'; '.join(wrong)}")
 

@@ -25,5 +25,9 @@ class Case:
     quick: bool = False  # also a case of `--quick`
     published: str = ""  # a published range, in the middle of which `expected` lies
 
+    @property
+    def key(self) -> str:
+        return f"{self.table} / {self.row} / {self.column}"
+
     def error(self, found: float) -> float:
         return found / self.expected - 1.0 if self.expected else found

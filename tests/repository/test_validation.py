@@ -30,24 +30,26 @@ def recorded() -> list[dict[str, Any]]:
 
 def test_fast_cases_hold_and_give_what_is_recorded(tmp_path: Path) -> None:
     """The script ends without an error beyond a bound; its numbers are those of the results, to rounding."""
+    from validation import key_of
+
     out = tmp_path / "validation.json"
     command = [sys.executable, "benchmarks/validation.py", "--quick", "--out", str(out)]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     result = json.loads(out.read_text())
     assert {"command", "created", "commit", "machine", "versions"} <= result.keys()
-    known = {(row["table"], row["row"], row["column"]): row["found"] for row in recorded()}
+    known = {key_of(row): row["found"] for row in recorded()}
     assert {row["table"] for row in result["rows"]} == {"Exact cases", "Cantilever", "Torsion", "Cantilever strip"}
     for row in result["rows"]:
         assert {"command", "created", "commit", "machine", "torch"} <= row["run"].keys()
         # Newton's method ends where a step is 1e-11 of the scene; sags are 1e-5 of it and more
-        assert row["found"] == pytest.approx(known[row["table"], row["row"], row["column"]], rel=1e-6, abs=1e-10)
+        assert row["found"] == pytest.approx(known[key_of(row)], rel=1e-6, abs=1e-10)
 
 
 def test_results_have_every_case_and_hold() -> None:
     from validation import CASES, key_of
 
-    assert [key_of(row) for row in recorded()] == [(case.table, case.row, case.column) for case in CASES]
+    assert [key_of(row) for row in recorded()] == [case.key for case in CASES]
     for row, case in zip(recorded(), CASES, strict=True):
         assert (row["expected"], row["bound"]) == (pytest.approx(case.expected, rel=1e-9), case.bound)
         assert row["error"] == pytest.approx(case.error(row["found"]), rel=1e-9, abs=1e-15)
