@@ -20,8 +20,8 @@ AdjointOutputs adjoint_system_typed(const AdjointTensors& t, double time_step) {
   SolvedStep<Backend, T> step(t, time_step);
   auto& call = step.call;
   const Material<T>& m = call.material;
-  const bool own = step.touching || environments_of(t.material) > 1 || m.masses.stride ||
-                   m.damping.stride || m.pin_stiffness.stride;
+  const bool own = step.touching || environments_of(t.material).value_or(1) != 1 ||
+                   m.masses.stride || m.damping.stride || m.pin_stiffness.stride;
   call.rows = own ? call.batch : 1;
   const std::int64_t vertices = call.plan.vertices;
   const at::TensorOptions options = t.after.options();
