@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import meshio
 import numpy as np
 import pytest
 import torch
@@ -298,3 +299,6 @@ def test_files_for_paraview(tmp_path: Path) -> None:
     for kind in KINDS:
         sim = simulator(small_body(kind), torch.float32, iterations=2)
         sim.write_vtu(tmp_path / f"{kind}.vtu", sim.rest_state(1))
+        written = meshio.read(tmp_path / f"{kind}.vtu")
+        assert len(written.points) == sim.vertices
+        assert sum(len(cells.data) for cells in written.cells) >= max(1, sim.stiffness.shape[-1])
