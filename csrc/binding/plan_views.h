@@ -181,11 +181,6 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
                     "all, got ",
                     plan.patches, " patches with up to ", plan.most_slots, " of ", plan.slots,
                     " slots; compile the scene again");
-  TORCH_CHECK_VALUE((plan.members == 1 || plan.members == 2 || plan.members == 4) &&
-                        plan.blocks % plan.members == 0,
-                    "plan.sizes must have groups of 1, 2 or 4 tetrahedra, and whole groups of "
-                    "blocks, got ",
-                    plan.members, " and ", plan.blocks, " blocks; compile the scene again");
   PlanRows count{};
   count.size = plan_size_count;
   count.vertex = plan.vertices;
@@ -204,6 +199,11 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.name = arrays[at++].const_data_ptr<type>();
 #include "views/cpu_plan.def"
 #undef X
+  TORCH_CHECK_VALUE((plan.members == 1 || plan.members == 2 || plan.members == 4) &&
+                        plan.blocks % plan.members == 0,
+                    "plan.sizes must have groups of 1, 2 or 4 tetrahedra, and whole groups of "
+                    "blocks, got ",
+                    plan.members, " and ", plan.blocks, " blocks; compile the scene again");
   if (stencils) view_stencils(plan, arrays, plan_arrays, place);
   if (levels)
     plan.levels = levels_view<T>(arrays, levels_at, plan.vertices,

@@ -84,8 +84,7 @@ PD_HD Mat3<R> corotated_stress(const Mat3<R>& f, const Mat3<R>& strain, const R&
                                const R& tension) {
   const R rest = weight - tension;
   Mat3<R> stress;
-  for (int a = 0; a < 3; ++a)
-    stress.row[a] = multiply_add(tension, f.row[a], rest * strain.row[a]);
+  for (int a = 0; a < 3; ++a) stress.row[a] = multiply_add(tension, f.row[a], rest * strain.row[a]);
   return stress;
 }
 
@@ -96,8 +95,8 @@ PD_HD Mat3<R> corotated_stress_change(const Mat3<R>& df, const Mat3<R>& rotation
   const R rest = weight - tension;
   Mat3<R> stress;
   for (int a = 0; a < 3; ++a) {
-    stress.row[a] = multiply_add(
-        change, rotation.row[a], subtract_product(weight * df.row[a], rest, dr.row[a]));
+    stress.row[a] = multiply_add(change, rotation.row[a],
+                                 subtract_product(weight * df.row[a], rest, dr.row[a]));
   }
   return stress;
 }
@@ -123,9 +122,9 @@ struct ParameterSlopes {
   }
 
   // dE = sum_e V 2 mu (F - R) : dF + (sum_e V lambda) phi'(t) dt: `strains` are (F - R) : dF, `changes` R : dF.
-  PD_HD static ParameterSlopes of_product(const GroupTension<R>& tension, const R (&traces)[Members],
-                                          const R (&strains)[Members], const R (&changes)[Members],
-                                          const R (&weight)[Members],
+  PD_HD static ParameterSlopes of_product(const GroupTension<R>& tension,
+                                          const R (&traces)[Members], const R (&strains)[Members],
+                                          const R (&changes)[Members], const R (&weight)[Members],
                                           const R (&pressure)[Members]) {
     ParameterSlopes slopes;
     const R change = group_average(changes, pressure), curved = tension.curvature() * change;
@@ -155,8 +154,7 @@ struct ParameterSlopes {
     const R share = sum * slope / select(attained > none, attained, one);
     for (int m = 0; m < Members; ++m) {
       by_weight[m] = select(attains[m] > none, share / pressure[m], none);
-      by_pressure[m] =
-          select(attains[m] > none, -(by_weight[m] * (weight[m] / pressure[m])), none);
+      by_pressure[m] = select(attains[m] > none, -(by_weight[m] * (weight[m] / pressure[m])), none);
     }
   }
 };

@@ -124,14 +124,13 @@ struct SolidGradient {
       for (int m = 0; m < members; ++m) {
         const int s = first + m;
         if (Energy && wanted) {
-          elements.sum(s) = multiply_add(
-              half * weight[m], frobenius(strain[m], strain[m]),
-              multiply_add(pressure[m], tension.energy(), elements.sum(s)));
+          elements.sum(s) =
+              multiply_add(half * weight[m], frobenius(strain[m], strain[m]),
+                           multiply_add(pressure[m], tension.energy(), elements.sum(s)));
         }
         Vec3<R> g[4];
-        corner_forces(
-            corotated_stress(f[s], strain[m], weight[m], pressure[m] * tension.slope),
-            elements.rest(s), g);
+        corner_forces(corotated_stress(f[s], strain[m], weight[m], pressure[m] * tension.slope),
+                      elements.rest(s), g);
         elements.add(s, g);
       }
     }
@@ -196,8 +195,7 @@ struct GroupChange : GroupState<R, Members> {
   R change[Members];  // R : dF
 
   template <class Elements>
-  PD_HD GroupChange(const Elements& elements, int first)
-      : GroupState<R, Members>(elements, first) {
+  PD_HD GroupChange(const Elements& elements, int first) : GroupState<R, Members>(elements, first) {
     for (int m = 0; m < Members; ++m) {
       Vec3<R> dx[4];
       elements.corners(first + m, 1, dx);
@@ -207,9 +205,7 @@ struct GroupChange : GroupState<R, Members> {
   }
 
   // (F - R) : dF
-  PD_HD R strain_change(int m) const {
-    return frobenius(this->f[m] - this->rotation[m], df[m]);
-  }
+  PD_HD R strain_change(int m) const { return frobenius(this->f[m] - this->rotation[m], df[m]); }
 };
 
 // Second derivative of every element's energy at field 0, along field 1.
@@ -240,10 +236,10 @@ struct SolidHessian {
       for (int m = 0; m < members; ++m) {
         const Mat3<R> dr = rotation_differential(group.f[m], group.rotation[m], group.df[m]);
         Vec3<R> g[4];
-        corner_forces(corotated_stress_change(group.df[m], group.rotation[m], dr, group.weight[m],
-                                              group.pressure[m] * tension.slope,
-                                              group.pressure[m] * change),
-                      elements.rest(first + m), g);
+        corner_forces(
+            corotated_stress_change(group.df[m], group.rotation[m], dr, group.weight[m],
+                                    group.pressure[m] * tension.slope, group.pressure[m] * change),
+            elements.rest(first + m), g);
         elements.add(first + m, g);
       }
     }
@@ -282,95 +278,6 @@ PD_HD void each_tension(const Elements& elements, const Visit& visit) {
     for (int m = 0; m < members; ++m) visit(first + m, group.pressure[m] * energy);
   }
 }
-
-// Energy of every element; with Poisson's ratio its share V (mu |F - R|^2 + lambda phi(t)) of its group's. Like the
-// fields below, it passes numbers to write(elements, s, numbers...).
-struct ElementEnergy {
-  template <int N, class Elements, class Write>
-  PD_HD void run(const Elements& elements, const Write& write) const {
-    using R = typename Elements::R;
-    [[maybe_unused]] R tension[N];
-    if constexpr (Grouped<Elements>)
-      each_tension<N>(elements, [&](int s, const R& energy) { tension[s] = energy; });
-    for (int s = 0; s < N; ++s) {
-      Vec3<R> x[4];
-      elements.corners(s, 0, x);
-      const Mat3<R> d = strain(x, elements.rest(s));
-      R energy = R(scalar_of<R>(0.5)) * elements.weight(s) * frobenius(d, d);
-      if constexpr (Grouped<Elements>) energy = energy + tension[s];
-      write(elements, s, energy);
-    }
-  }
-};
-
-// Derivative of that energy along field 1.
-struct ElementEnergyProduct {
-  template <int N, class Elements, class Write>
-  PD_HD void run(const Elements& elements, const Write& write) const {
-    using R = typename Elements::R;
-    if constexpr (Grouped<Elements>) {
-      constexpr int members = Elements::members;
-      for (int first = 0; first < N; first += members) {
-        const GroupChange<R, members> group(elements, first);
-        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
-        const R change = tension.slope * group_average(group.change, group.pressure);
-        for (int m = 0; m < members; ++m)
-          write(elements, first + m,
-                multiply_add(group.pressure[m], change, group.weight[m] * group.strain_change(m)));
-      }
-    } else {
-      for (int s = 0; s < N; ++s) {
-        Vec3<R> x[4], dx[4];
-        elements.corners(s, 0, x);
-        elements.corners(s, 1, dx);
-        write(elements, s,
-              element_energy_product(x, dx, elements.rest(s), elements.weight(s)));
-      }
-    }
-  }
-};
-
-// Derivatives of the energy by V 2 mu and V lambda of every element in a group.
-struct LameSlope {
-  template <int N, class Elements, class Write>
-  PD_HD void run(const Elements& elements, const Write& write) const {
-    using R = typename Elements::R;
-    if constexpr (Grouped<Elements>) {
-      constexpr int members = Elements::members;
-      for (int first = 0; first < N; first += members) {
-        const GroupState<R, members> group(elements, first);
-        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
-        R squares[members];
-        for (int m = 0; m < members; ++m) squares[m] = group.square(m);
-        const auto slopes = ParameterSlopes<R, members>::of_energy(
-            tension, group.trace, squares, group.weight, group.pressure);
-        for (int m = 0; m < members; ++m)
-          write(elements, first + m, slopes.by_weight[m], slopes.by_pressure[m]);
-      }
-    }
-  }
-};
-
-// The same of the energy's derivative along field 1.
-struct LameProduct {
-  template <int N, class Elements, class Write>
-  PD_HD void run(const Elements& elements, const Write& write) const {
-    using R = typename Elements::R;
-    if constexpr (Grouped<Elements>) {
-      constexpr int members = Elements::members;
-      for (int first = 0; first < N; first += members) {
-        const GroupChange<R, members> group(elements, first);
-        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
-        R strains[members];
-        for (int m = 0; m < members; ++m) strains[m] = group.strain_change(m);
-        const auto slopes = ParameterSlopes<R, members>::of_product(
-            tension, group.trace, strains, group.change, group.weight, group.pressure);
-        for (int m = 0; m < members; ++m)
-          write(elements, first + m, slopes.by_weight[m], slopes.by_pressure[m]);
-      }
-    }
-  }
-};
 
 // Terms of a report, for each corner of an element. They are a quarter of the energy [J]; w V |grad N_c|^2 |x|, the
 // force per relative error of positions [N]; and a quarter if det F <= 0. Padding has no weight and adds zeros. With

@@ -303,7 +303,7 @@ struct FieldCall : P::EffectViews {
   const T* direction = nullptr;  // [batch, vertices, 3], for the products
   T* out =
       nullptr;  // [batch, vertices, 3], [batch, tets] of element energies, [batch, tets, 2] of lame_product,
-               // [batch, vertices] of the diagonal
+                // [batch, vertices] of the diagonal
   // stiffness_at_rest: [batch, elements], tetrahedra and then stencils kind by kind
 };
 

@@ -1,6 +1,7 @@
 // Elastic energy and its derivatives at given positions, and their diagonal, environment by environment.
 #pragma once
 #include "cpu/step/sweep.h"
+#include "elements/solid_fields.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -152,10 +153,10 @@ class FieldPass {
         const auto write = [&](const auto& elements, int s, const auto&... number) {
           write_lanes<Numbers>(environment, elements.part(s), {number...});
         };
-        each_element(plan_, patch,
-                     ElementsAcross<Fields, T, Members>(plan_, corners, w_.weights(), nullptr,
-                                                        unused),
-                     Written<Element, decltype(write)>{element, write});
+        each_element(
+            plan_, patch,
+            ElementsAcross<Fields, T, Members>(plan_, corners, w_.weights(), nullptr, unused),
+            Written<Element, decltype(write)>{element, write});
       });
     }
   }
@@ -189,7 +190,8 @@ class FieldPass {
   // By E and nu, from slopes by V 2 mu and V lambda.
   void to_parameters(std::int64_t environment, std::int64_t e, T* slope) const {
     const int32 t = plan_.tet_order[e];
-    const LameSlopes<T> by(call_.stiffness.of(environment)[t], call_.effects.poisson.of(environment)[t]);
+    const LameSlopes<T> by(call_.stiffness.of(environment)[t],
+                           call_.effects.poisson.of(environment)[t]);
     by.chain(plan_.tet_volume[e], slope);
   }
 

@@ -98,8 +98,8 @@ class TurningElements {
   // that of `turning_pair`. A pack of elements seldom has all groups; the others would add zeros.
   template <bool Dilates, class R>
   static void add_strains(const TurningStrain<R> (&strain)[turning_groups],
-                          const bool (&present)[turning_groups], const R& weight,
-                          const R& pressure, R (&sum)[turning_pairs]) {
+                          const bool (&present)[turning_groups], const R& weight, const R& pressure,
+                          R (&sum)[turning_pairs]) {
     for (int k = 0; k < turning_groups; ++k) {
       if (!present[k]) continue;
       R own[6][6];

@@ -32,7 +32,8 @@ void add_slots(MeshPlan& plan, const Numbering& n, const MeshElements& elements,
   }
   plan.patch_slot.push_back(std::int32_t(plan.slot_vertex.size()));
   if (plan.slot_vertex.size() - begin > std::numeric_limits<std::int16_t>::max())
-    throw std::invalid_argument("a patch has more vertices than 16 bits count: give a smaller patch_size");
+    throw std::invalid_argument(
+        "a patch has more vertices than 16 bits count: give a smaller patch_size");
 }
 
 // One lane of a block of tetrahedra.
@@ -133,8 +134,7 @@ MeshPlan build_plan(const MeshElements& elements, int patch_size,
                     const std::function<void(double)>& progress) {
   // tetrahedra and stencils
   const std::int64_t single = elements.tet_count + elements.count() - elements.solids();
-  const Partition mesh =
-      partition_mesh(elements, (single + patch_size - 1) / patch_size, lanes);
+  const Partition mesh = partition_mesh(elements, (single + patch_size - 1) / patch_size, lanes);
   progress(0.3);
 
   Numbering numbering = number_vertices(mesh, elements);

@@ -22,8 +22,9 @@ struct StencilGroup {
 struct TetGroups {
   std::vector<std::int32_t> tets;     // user's numbers, group by group, ascending in each
   std::vector<std::int64_t> corners;  // [4 tets] in that order
-  std::vector<std::int64_t> start;    // first of each group, and the end; empty: each tetrahedron alone
-  int members = 1;                    // places of every group: 1, 2 or 4; smaller ones are filled up
+  std::vector<std::int64_t>
+      start;        // first of each group, and the end; empty: each tetrahedron alone
+  int members = 1;  // places of every group: 1, 2 or 4; smaller ones are filled up
 
   bool is_empty() const { return start.empty(); }
   std::int64_t count() const { return std::ssize(start) - 1; }
