@@ -14,6 +14,9 @@ namespace pd {
 namespace {
 
 struct Cpu {
+  static constexpr bool sums_tets = true;  // in Field::effect_energy
+  static bool has_stencils(at::TensorList) { return true; }
+
   template <class T>
   using Plan = pd::Plan<T>;
 
