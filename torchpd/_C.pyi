@@ -25,6 +25,7 @@ def build_device_plan(
     fixed: bool,
     piece: NDArray[int32],
     progress: Callable[[float], None],
+    tet_group: NDArray[int64] | None = None,
 ) -> dict[str, NDArray[Any]]: ...
 def build_multilevel(
     positions: NDArray[float64],

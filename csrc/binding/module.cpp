@@ -248,9 +248,11 @@ void check_cluster(std::int64_t vertices, const Indices& tets, int patches) {
 py::dict build_device_plan(const Doubles& positions, const Indices& tets,
                            const std::vector<Stencils>& stencils, int patches, int kernel,
                            bool fixed, const Numbers& piece,
-                           const std::function<void(double)>& progress) {
-  const pd::MeshElements elements = mesh_elements(positions, tets, stencils);
-  if (patches < 1 || patches > elements.count()) {
+                           const std::function<void(double)>& progress,
+                           const std::optional<Indices>& tet_group) {
+  pd::MeshElements elements = mesh_elements(positions, tets, stencils);
+  elements.averaged = tet_groups(tet_group, tets);
+  if (patches < 1 || patches > tets.shape(0) + elements.count() - elements.solids()) {
     throw py::value_error("patches must lie in 1.." + std::to_string(elements.count()) +
                           ", the number of elements, got " + std::to_string(patches));
   }
@@ -474,7 +476,7 @@ PYBIND11_MODULE(_C, m) {
         py::arg("tet_group"), py::arg("patch_size"), py::arg("progress"));
   m.def("build_device_plan", &build_device_plan, py::arg("positions"), py::arg("tets"),
         py::arg("stencils"), py::arg("patches"), py::arg("kernel"), py::arg("fixed"),
-        py::arg("piece"), py::arg("progress"));
+        py::arg("piece"), py::arg("progress"), py::arg("tet_group") = py::none());
   m.def("build_multilevel", &build_multilevel, py::arg("positions"), py::arg("tets"),
         py::arg("stencils"), py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"),
         py::arg("most_direct"), py::arg("folded"), py::arg("threads"), py::arg("progress"));

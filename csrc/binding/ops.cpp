@@ -14,6 +14,9 @@ namespace pd {
 namespace {
 
 struct Cpu {
+  static constexpr bool sums_tets = true;  // in Field::effect_energy
+  static bool has_stencils(at::TensorList) { return true; }
+
   template <class T>
   using Plan = pd::Plan<T>;
 
@@ -28,7 +31,6 @@ struct Cpu {
   static Plan<T> plan_view(at::TensorList arrays, const Place& place) {
     return pd::plan_view<T>(arrays, place);
   }
-  static constexpr bool sums_tets = true;
   template <class Call>
   static void view_stencils(Call&, at::TensorList, const Place&) {}  // the plan has them
   template <class Call>

@@ -216,14 +216,18 @@ Tensor run_field(Field field, const Tensor& positions, const Tensor& direction,
 template <class Backend>
 Tensor effect_energy(const Tensor& positions, at::TensorList material, at::TensorList plan) {
   check_positions(positions, "positions");
+  Tensor tets;
+  if constexpr (!Backend::sums_tets) {
+    tets = run_field<Backend>(Field::element_energy, positions, {}, material, plan).sum(-1);
+    if (!Backend::has_stencils(plan)) return tets;
+  }
   const Tensor out = at::zeros({positions.size(0)}, positions.options());
   if (positions.scalar_type() == at::kFloat) {
     field_typed<Backend, float>(Field::effect_energy, positions, {}, material, plan, out);
   } else {
     field_typed<Backend, double>(Field::effect_energy, positions, {}, material, plan, out);
   }
-  if constexpr (Backend::sums_tets) return out;
-  return out + run_field<Backend>(Field::element_energy, positions, {}, material, plan).sum(-1);
+  return tets.defined() ? tets + out : out;
 }
 
 // The place of Poisson's ratio in stencil_products.
@@ -399,6 +403,16 @@ Tensor elastic_diagonal(at::TensorList material, at::TensorList plan, bool weigh
              : diagonal_typed<Backend, double>(material, plan, weighted, time_step);
 }
 
+// 2 mu + lambda of every tetrahedron [tets] or [batch, tets], Young's modulus without Poisson's ratio; see
+// elements/lame.h.
+inline Tensor matrix_stiffness(at::TensorList material) {
+  const Tensor& youngs = array_of(material, "stiffness");
+  if (!has_poisson(material)) return youngs.clone();
+  const Tensor& poisson = array_of(material, "poisson");
+  const Tensor twice_mu = youngs / (1 + poisson);
+  return twice_mu + twice_mu * (poisson / (1 - 2 * poisson));
+}
+
 // Stiffness of every element at rest, as a preconditioner takes it, [elements] or [batch, elements]: that of
 // tetrahedra [Pa], then that of stencils kind by kind.
 template <class Backend>
@@ -406,6 +420,7 @@ Tensor stiffness_at_rest(at::TensorList material, at::TensorList plan, double ti
   const Tensor& stiffness = array_of(material, "stiffness");
   check_real(stiffness, "stiffness", "[tets] or [batch, tets] (Pa)");
   if (material.size() == material_arrays) return stiffness.clone();
+  if (!Backend::has_stencils(plan)) return matrix_stiffness(material);
   const Field field = Field::stiffness_at_rest;
   return stiffness.scalar_type() == at::kFloat
              ? material_field<Backend, float>(field, material, plan, false, time_step)

@@ -243,7 +243,8 @@ constexpr int part_slot_array = int(DevicePlanArray::part_slot);
 struct DevicePlanRows {
   std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
       shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part,
-      stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex;
+      stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex,
+      coupled_block;
 };
 
 // Whether the arrays of the stencils follow those of the plan; a plan with levels has none.
@@ -334,6 +335,7 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.computed_block = computed ? plan.blocks : 0;
   count.computed_patch = computed ? plan.patches : 0;
   count.sender = plan.senders;
+  count.coupled_block = plan.members == 4 ? plan.blocks : 0;
   TORCH_CHECK_VALUE(plan.kernel != 2 || plan.senders >= count.shared_slot,
                     "plan.sizes must count a row of senders for each of the ", count.shared_slot,
                     " shared slots of kernel 2, got ", plan.senders, "; compile the scene again");

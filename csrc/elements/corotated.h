@@ -14,11 +14,30 @@
 #pragma once
 #include "math/rotation.h"
 
+#include <type_traits>
+
 namespace pd::inline PD_TARGET {
 
 // Elements in groups: `members` packs after one another, with a `pressure` beside the weight: V lambda and V 2 mu.
 template <class Elements>
 concept Grouped = requires { requires(Elements::members > 0); };
+
+// A group whose members are all at hand. Elsewhere other lanes have some of them: then sum(a) and least(a) combine a
+// number with theirs, and any(mask) is true in all of them or none.
+struct WholeGroup {
+  template <class R>
+  PD_HD R sum(const R& a) const {
+    return a;
+  }
+  template <class R>
+  PD_HD R least(const R& a) const {
+    return a;
+  }
+  template <class Mask>
+  PD_HD bool any(const Mask& mask) const {
+    return pd::any(mask);
+  }
+};
 
 // R : (F - R) from F and F - R
 template <class R>
@@ -27,14 +46,17 @@ PD_HD R trace_strain(const Mat3<R>& f, const Mat3<R>& strain) {
 }
 
 // Average over a group, with the weights V lambda; zero where none has any.
-template <class R, int Members>
-PD_HD R group_average(const R (&value)[Members], const R (&pressure)[Members]) {
-  if constexpr (Members == 1) return value[0];
+template <class R, int Members, class Lanes = WholeGroup>
+PD_HD R group_average(const R (&value)[Members], const R (&pressure)[Members],
+                      const Lanes& lanes = {}) {
+  if constexpr (Members == 1 && std::is_same_v<Lanes, WholeGroup>) return value[0];
   R sum = pressure[0], product = pressure[0] * value[0];
   for (int m = 1; m < Members; ++m) {
     sum = sum + pressure[m];
     product = multiply_add(pressure[m], value[m], product);
   }
+  sum = lanes.sum(sum);
+  product = lanes.sum(product);
   using T = scalar_of<R>;
   return product * reciprocal(select(lesser(sum, -sum) < R(T(0)), sum, R(T(1))));
 }
@@ -46,14 +68,14 @@ struct GroupTension {
   R limit;         // c, infinite where nothing is capped
 
   // `weight`: V 2 mu of the members; `pressure`: V lambda
-  template <int Members>
+  template <int Members, class Lanes = WholeGroup>
   PD_HD GroupTension(const R (&traces)[Members], const R (&weight)[Members],
-                     const R (&pressure)[Members])
-      : trace(group_average(traces, pressure)), slope(trace), limit(scalar_of<R>(HUGE_VAL)) {
+                     const R (&pressure)[Members], const Lanes& lanes = {})
+      : trace(group_average(traces, pressure, lanes)), slope(trace), limit(scalar_of<R>(HUGE_VAL)) {
     auto below = trace * pressure[0] <= weight[0];
     for (int m = 1; m < Members; ++m) below = below && trace * pressure[m] <= weight[m];
-    if (any(!below)) [[unlikely]]
-      cap(weight, pressure);
+    if (lanes.any(!below)) [[unlikely]]
+      cap(weight, pressure, lanes);
   }
 
   PD_HD R energy() const {
@@ -67,13 +89,14 @@ struct GroupTension {
   }
 
  private:
-  template <int Members>
-  PD_HD void cap(const R (&weight)[Members], const R (&pressure)[Members]) {
+  template <int Members, class Lanes>
+  PD_HD void cap(const R (&weight)[Members], const R (&pressure)[Members], const Lanes& lanes) {
     using T = scalar_of<R>;
     for (int m = 0; m < Members; ++m) {
       const R own = select(pressure[m] > R(T(0)), weight[m] / pressure[m], R(T(HUGE_VAL)));
       limit = lesser(limit, own);
     }
+    limit = lanes.least(limit);
     slope = lesser(trace, limit);
   }
 };
@@ -102,16 +125,16 @@ PD_HD Mat3<R> corotated_stress_change(const Mat3<R>& df, const Mat3<R>& rotation
 }
 
 // Derivatives by V 2 mu and by V lambda of each member of a group: of its energy, or of dE along a direction.
-template <class R, int Members>
+template <class R, int Members, class Lanes = WholeGroup>
 struct ParameterSlopes {
   R by_weight[Members], by_pressure[Members];
 
   // E: `squares` are |F - R|^2 / 2.
   PD_HD static ParameterSlopes of_energy(const GroupTension<R>& tension, const R (&traces)[Members],
                                          const R (&squares)[Members], const R (&weight)[Members],
-                                         const R (&pressure)[Members]) {
+                                         const R (&pressure)[Members], const Lanes& lanes = {}) {
     ParameterSlopes slopes;
-    slopes.share_cap(tension, tension.trace - tension.limit, weight, pressure);
+    slopes.share_cap(tension, tension.trace - tension.limit, weight, pressure, lanes);
     for (int m = 0; m < Members; ++m) {
       slopes.by_weight[m] = slopes.by_weight[m] + squares[m];
       slopes.by_pressure[m] =
@@ -125,10 +148,11 @@ struct ParameterSlopes {
   PD_HD static ParameterSlopes of_product(const GroupTension<R>& tension,
                                           const R (&traces)[Members], const R (&strains)[Members],
                                           const R (&changes)[Members], const R (&weight)[Members],
-                                          const R (&pressure)[Members]) {
+                                          const R (&pressure)[Members], const Lanes& lanes = {}) {
     ParameterSlopes slopes;
-    const R change = group_average(changes, pressure), curved = tension.curvature() * change;
-    slopes.share_cap(tension, change, weight, pressure);
+    const R change = group_average(changes, pressure, lanes);
+    const R curved = tension.curvature() * change;
+    slopes.share_cap(tension, change, weight, pressure, lanes);
     for (int m = 0; m < Members; ++m) {
       slopes.by_weight[m] = slopes.by_weight[m] + strains[m];
       slopes.by_pressure[m] =
@@ -141,7 +165,7 @@ struct ParameterSlopes {
  private:
   // By the cap, whose factor is (sum_e V lambda) `slope`: members that attain it have equal parts of its derivative.
   PD_HD void share_cap(const GroupTension<R>& tension, const R& slope, const R (&weight)[Members],
-                       const R (&pressure)[Members]) {
+                       const R (&pressure)[Members], const Lanes& lanes) {
     using T = scalar_of<R>;
     const R none(T(0)), one(T(1));
     R sum = none, attained = none, attains[Members];
@@ -151,6 +175,8 @@ struct ParameterSlopes {
       attained = attained + attains[m];
       sum = sum + pressure[m];
     }
+    sum = lanes.sum(sum);
+    attained = lanes.sum(attained);
     const R share = sum * slope / select(attained > none, attained, one);
     for (int m = 0; m < Members; ++m) {
       by_weight[m] = select(attains[m] > none, share / pressure[m], none);

@@ -7,6 +7,9 @@
 
 namespace pd::inline PD_TARGET {
 
+// What the weights of tetrahedra are for: forces, the diagonal that cannot diverge, or the plain one.
+enum class WeightKind { force, majoriser, matrix };
+
 template <class T>
 struct Lame {
   T twice_mu, lambda;  // [Pa]
@@ -23,6 +26,12 @@ struct Lame {
 
   // Stiffness of the scalar matrix A that preconditioners are made of.
   PD_HD T matrix() const { return twice_mu + lambda; }
+
+  PD_HD T of(WeightKind kind, T bound) const {
+    return kind == WeightKind::majoriser ? majoriser(bound)
+           : kind == WeightKind::matrix  ? matrix()
+                                         : twice_mu;
+  }
 };
 
 // What the scalar matrix A weighs the tetrahedra of an environment with [Pa]: Young's modulus without Poisson's ratio.

@@ -73,6 +73,13 @@ struct SolidGradient {
                       const R (&weight)[Count], Vec3<R> (&g)[3 + Count], R& energy) const {
     solid_face_gradient<Energy>(x, rest, weight, wanted, g, energy);
   }
+  // The same of one group with Poisson's ratio, or of the part of it that a lane has.
+  template <class R, int Count, class Lanes>
+  PD_HD void run_group(const Vec3<R> (&x)[3 + Count], const FaceRest<R, Count>& rest,
+                       const R (&weight)[Count], const R (&pressure)[Count], bool alone,
+                       const Lanes& lanes, Vec3<R> (&g)[3 + Count], R& energy) const {
+    corotated_face_gradient<Energy>(x, rest, weight, pressure, alone, lanes, wanted, g, energy);
+  }
 
   template <int N, class Elements>
   PD_HD void run(const Elements& elements) const {
@@ -87,7 +94,17 @@ struct SolidGradient {
       i[s] = invariants(f[s]);
     }
     for (int s = 0; s < N; ++s) root[s] = largest_root(i[s]);
-    if constexpr (Grouped<Elements>) return run_groups<N>(elements, f, i, root);
+    if constexpr (Grouped<Elements>) {
+      run_groups<N>(elements, f, i, root);
+    } else {
+      run_each<N>(elements, f, i, root);
+    }
+  }
+
+ private:
+  template <int N, class Elements, class R>
+  PD_HD void run_each(const Elements& elements, const Mat3<R> (&f)[N], const Invariants<R> (&i)[N],
+                      const Root<R> (&root)[N]) const {
     for (int s = 0; s < N; ++s) {
       const R weight = elements.weight(s);
       Mat3<R> stress = finish_strain(f[s], i[s], root[s], Energy ? R(scalar_of<R>(1)) : weight);
@@ -104,7 +121,6 @@ struct SolidGradient {
     }
   }
 
- private:
   template <int N, class Elements, class R>
   PD_HD void run_groups(const Elements& elements, const Mat3<R> (&f)[N],
                         const Invariants<R> (&i)[N], const Root<R> (&root)[N]) const {
@@ -120,7 +136,7 @@ struct SolidGradient {
         weight[m] = elements.weight(s);
         pressure[m] = elements.pressure(s);
       }
-      const GroupTension<R> tension(trace, weight, pressure);
+      const GroupTension<R> tension(trace, weight, pressure, elements.lanes());
       for (int m = 0; m < members; ++m) {
         const int s = first + m;
         if (Energy && wanted) {
@@ -215,13 +231,16 @@ struct SolidHessian {
   template <int N, class Elements>
   PD_HD void run(const Elements& elements) const {
     using R = typename Elements::R;
-    if constexpr (Grouped<Elements>) return run_groups<N, R>(elements);
-    for (int s = 0; s < N; ++s) {
-      Vec3<R> x[4], dx[4], g[4];
-      elements.corners(s, 0, x);
-      elements.corners(s, 1, dx);
-      solid_hessian_product(x, dx, elements.rest(s), elements.weight(s), g);
-      elements.add(s, g);
+    if constexpr (Grouped<Elements>) {
+      run_groups<N, R>(elements);
+    } else {
+      for (int s = 0; s < N; ++s) {
+        Vec3<R> x[4], dx[4], g[4];
+        elements.corners(s, 0, x);
+        elements.corners(s, 1, dx);
+        solid_hessian_product(x, dx, elements.rest(s), elements.weight(s), g);
+        elements.add(s, g);
+      }
     }
   }
 
@@ -231,8 +250,9 @@ struct SolidHessian {
     constexpr int members = Elements::members;
     for (int first = 0; first < N; first += members) {
       const GroupChange<R, members> group(elements, first);
-      const GroupTension<R> tension(group.trace, group.weight, group.pressure);
-      const R change = tension.curvature() * group_average(group.change, group.pressure);
+      const GroupTension<R> tension(group.trace, group.weight, group.pressure, elements.lanes());
+      const R change =
+          tension.curvature() * group_average(group.change, group.pressure, elements.lanes());
       for (int m = 0; m < members; ++m) {
         const Mat3<R> dr = rotation_differential(group.f[m], group.rotation[m], group.df[m]);
         Vec3<R> g[4];
@@ -250,6 +270,7 @@ struct SolidHessian {
 // is minus infinity where that is negative, so that no neighbour can compensate.
 struct SolidDiagonal {
   static constexpr int strip = 1;
+  static constexpr bool weights_alone = true;  // reads neither positions nor groups
 
   template <int N, class Elements>
   PD_HD void run(const Elements& elements) const {
@@ -274,7 +295,8 @@ PD_HD void each_tension(const Elements& elements, const Visit& visit) {
   constexpr int members = Elements::members;
   for (int first = 0; first < N; first += members) {
     const GroupState<R, members> group(elements, first);
-    const R energy = GroupTension<R>(group.trace, group.weight, group.pressure).energy();
+    const R energy =
+        GroupTension<R>(group.trace, group.weight, group.pressure, elements.lanes()).energy();
     for (int m = 0; m < members; ++m) visit(first + m, group.pressure[m] * energy);
   }
 }

@@ -33,8 +33,9 @@ struct ElementEnergyProduct {
       constexpr int members = Elements::members;
       for (int first = 0; first < N; first += members) {
         const GroupChange<R, members> group(elements, first);
-        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
-        const R change = tension.slope * group_average(group.change, group.pressure);
+        const GroupTension<R> tension(group.trace, group.weight, group.pressure, elements.lanes());
+        const R change =
+            tension.slope * group_average(group.change, group.pressure, elements.lanes());
         for (int m = 0; m < members; ++m)
           write(elements, first + m,
                 multiply_add(group.pressure[m], change, group.weight[m] * group.strain_change(m)));
@@ -59,11 +60,12 @@ struct LameSlope {
       constexpr int members = Elements::members;
       for (int first = 0; first < N; first += members) {
         const GroupState<R, members> group(elements, first);
-        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
+        const GroupTension<R> tension(group.trace, group.weight, group.pressure, elements.lanes());
         R squares[members];
         for (int m = 0; m < members; ++m) squares[m] = group.square(m);
-        const auto slopes = ParameterSlopes<R, members>::of_energy(tension, group.trace, squares,
-                                                                   group.weight, group.pressure);
+        const auto lanes = elements.lanes();
+        const auto slopes = ParameterSlopes<R, members, decltype(lanes)>::of_energy(
+            tension, group.trace, squares, group.weight, group.pressure, lanes);
         for (int m = 0; m < members; ++m)
           write(elements, first + m, slopes.by_weight[m], slopes.by_pressure[m]);
       }
@@ -80,11 +82,12 @@ struct LameProduct {
       constexpr int members = Elements::members;
       for (int first = 0; first < N; first += members) {
         const GroupChange<R, members> group(elements, first);
-        const GroupTension<R> tension(group.trace, group.weight, group.pressure);
+        const GroupTension<R> tension(group.trace, group.weight, group.pressure, elements.lanes());
         R strains[members];
         for (int m = 0; m < members; ++m) strains[m] = group.strain_change(m);
-        const auto slopes = ParameterSlopes<R, members>::of_product(
-            tension, group.trace, strains, group.change, group.weight, group.pressure);
+        const auto lanes = elements.lanes();
+        const auto slopes = ParameterSlopes<R, members, decltype(lanes)>::of_product(
+            tension, group.trace, strains, group.change, group.weight, group.pressure, lanes);
         for (int m = 0; m < members; ++m)
           write(elements, first + m, slopes.by_weight[m], slopes.by_pressure[m]);
       }

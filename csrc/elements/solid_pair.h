@@ -9,6 +9,7 @@
 // elements/solid.h and R Q^T its R, so energies and forces are the same. The shared columns are computed once. That
 // saves a GPU a sixth of the instructions (tools/instructions.py), and a tetrahedron alone a thirtieth.
 #pragma once
+#include "elements/corotated.h"
 #include "math/rotation.h"
 
 namespace pd::inline PD_TARGET {
@@ -16,6 +17,10 @@ namespace pd::inline PD_TARGET {
 // An effect that implements run_face, for one tetrahedron or two.
 template <class Effect>
 concept OnFaces = requires { requires Effect::on_faces; };
+
+// An effect that reads rest shapes and weights alone.
+template <class Effect>
+concept ReadsWeightsAlone = requires { Effect::weights_alone; };
 
 template <class R, int Count>
 struct FaceRest {
@@ -193,7 +198,67 @@ PD_HD void solid_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, 
   g[0] = -((g[1] + g[2]) + g[0]);
 }
 
-// The same for two tetrahedra, with corners loaded when needed and forces stored when known. load(corner, position,
+// The same with Poisson's ratio, see elements/corotated.h; `weight` is V 2 mu, `pressure` V lambda. `alone`: each
+// tetrahedron has its own trace; else all of them average it, with those of other `lanes`.
+template <bool Energy, class R, int Count, class Lanes>
+PD_HD void corotated_face_gradient(const Vec3<R> (&x)[3 + Count], const FaceRest<R, Count>& rest,
+                                   const R (&weight)[Count], const R (&pressure)[Count], bool alone,
+                                   const Lanes& lanes, bool wanted, Vec3<R> (&g)[3 + Count],
+                                   R& energy) {
+  const R half(scalar_of<R>(0.5));
+  const Vec3<R> edge[2] = {x[1] - x[0], x[2] - x[0]};
+  const FaceColumns<R> face(edge, rest);
+  Vec3<R> third[Count], strain[Count][3];
+  R trace[Count], slope[Count], tension_energy[Count];
+  for (int e = 0; e < Count; ++e) {
+    const Vec3<R>& apex = rest.apex[e];
+    third[e] =
+        multiply_add(apex.z, x[3 + e] - x[0], multiply_add(apex.y, edge[1], apex.x * edge[0]));
+    const Invariants<R> i = face.invariants(third[e]);
+    finish_columns(face, third[e], i, largest_root(i), R(scalar_of<R>(1)), strain[e]);
+    trace[e] = (dot(face.first - strain[e][0], strain[e][0]) +
+                dot(face.second - strain[e][1], strain[e][1])) +
+               dot(third[e] - strain[e][2], strain[e][2]);
+  }
+  if (alone) {
+    for (int e = 0; e < Count; ++e) {
+      const GroupTension<R> tension({trace[e]}, {weight[e]}, {pressure[e]});
+      slope[e] = tension.slope;
+      if (Energy) tension_energy[e] = tension.energy();
+    }
+  } else {
+    const GroupTension<R> tension(trace, weight, pressure, lanes);
+    for (int e = 0; e < Count; ++e) {
+      slope[e] = tension.slope;
+      if (Energy) tension_energy[e] = tension.energy();
+    }
+  }
+  Vec3<R> first, second;
+  for (int e = 0; e < Count; ++e) {
+    const Vec3<R>& apex = rest.apex[e];
+    if (Energy && wanted) {
+      const R square = (dot(strain[e][0], strain[e][0]) + dot(strain[e][1], strain[e][1])) +
+                       dot(strain[e][2], strain[e][2]);
+      energy = multiply_add(half * weight[e], square,
+                            multiply_add(pressure[e], tension_energy[e], energy));
+    }
+    const R pull = pressure[e] * slope[e], left = weight[e] - pull;
+    const Vec3<R> stress[3] = {multiply_add(pull, face.first, left * strain[e][0]),
+                               multiply_add(pull, face.second, left * strain[e][1]),
+                               multiply_add(pull, third[e], left * strain[e][2])};
+    g[3 + e] = apex.z * stress[2];
+    first = e == 0 ? stress[0] : first + stress[0];
+    second = e == 0 ? stress[1] : second + stress[1];
+    g[1] = e == 0 ? apex.x * stress[2] : multiply_add(apex.x, stress[2], g[1]);
+    g[2] = e == 0 ? apex.y * stress[2] : multiply_add(apex.y, stress[2], g[2]);
+    g[0] = e == 0 ? g[3] : g[0] + g[3 + e];
+  }
+  g[1] = multiply_add(rest.q, second, multiply_add(rest.p, first, g[1]));
+  g[2] = multiply_add(rest.r, second, g[2]);
+  g[0] = -((g[1] + g[2]) + g[0]);
+}
+
+// The same for two tetrahedra without it, with corners loaded when needed and forces stored when known. load(corner, position,
 // rest) gives rest positions in any `unit` [m]; store(corner, force) takes forces. `factor` is unit^2 / det Dm of
 // each. between() runs after the first tetrahedron, where the fewest registers are in use.
 template <bool Energy, class Rest, class R, class Load, class Store, class Between>

@@ -76,7 +76,8 @@ enum StencilSize : int {
 
 template <class T>
 struct EffectViews;
-struct NoEffectViews;
+template <class T>
+struct DeviceEffectViews;
 
 template <class T>
 struct Plan {
@@ -111,7 +112,7 @@ enum DeviceSize : int {
 template <class T>
 struct DevicePlan {
   using real = T;
-  using EffectViews = NoEffectViews;
+  using EffectViews = DeviceEffectViews<T>;
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/gpu_plan.def"
 #undef X
@@ -203,7 +204,11 @@ struct EffectViews {
   // Field::effect_products: for each array of the effects [batch, rows], null if not wanted
   T* products[effect_count] = {};
 };
-struct NoEffectViews {};
+// On a GPU, of tetrahedra; data is null without Poisson's ratio.
+template <class T>
+struct DeviceEffectViews {
+  Values<T> poisson;
+};
 
 template <class T>
 struct Material {

@@ -51,7 +51,7 @@ def compile_device_plan(
     with compile_progress(elements, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
             values.rest_positions, values.tets, stencil_arrays(values), patches, kernel, dtype == torch.float32, piece,
-            advance,
+            advance, values.tet_group,
         )  # fmt: skip
     pins = len(values.pin_vertices)
     arrays["sizes"][_SIZE_PINS] = pins

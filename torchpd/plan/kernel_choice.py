@@ -194,6 +194,8 @@ class _PlanBuilder(NamedTuple):
 
     def is_candidate(self, kernel: str, gpu: Properties) -> bool:
         """Whether "auto" considers a kernel."""
+        if kernel == "cluster" and self.values.poisson is not None:
+            return False  # patches of a cluster would cut the groups that average their volume strain
         return kernel != "cluster" or (gpu.cluster > 1 and self.tets <= _CLUSTER_TETS)
 
     def refuse_size(self, kernel: str, patches: int, gpu: Properties) -> str:
@@ -377,6 +379,11 @@ def choose_plan(
         raise ValueError(
             'Simulator: kernel="cluster" needs thread block clusters (NVIDIA compute capability 9.0), and this GPU has '
             'none; take "auto", "block", "grid" or "stream"'
+        )
+    if kernel == "cluster" and values.poisson is not None:
+        raise ValueError(
+            'Simulator: kernel must not be "cluster" for a Solid with Poisson\'s ratio, whose groups its patches would '
+            'cut; take "auto", "block", "grid" or "stream"'
         )
     if values.stencils and kernel in ("auto", "benchmark"):
         plans = _mixed_plans(scene, gpu, batch)

@@ -29,7 +29,15 @@ def average_over(mesh: TetMesh, bulk_modulus: Array, size: int | None) -> Index:
         size = 2 if is_lattice(mesh) else 4
     if size == 1:
         return np.arange(len(mesh.tets), dtype=np.int64)
-    return _grown(_neighbours(mesh.tets, bulk_modulus), len(mesh.tets), size)
+    neighbours = _neighbours(mesh.tets, bulk_modulus)
+    pairs = _grown(neighbours, len(mesh.tets), 2)
+    if size == 2:
+        return pairs
+    # groups of four are two pairs, which a GPU computes in neighbouring lanes
+    beside: list[list[int]] = [[] for _ in range(int(pairs.max()) + 1)]
+    for own, others in zip(pairs, neighbours, strict=True):
+        beside[own].extend(int(pairs[other]) for other in others if pairs[other] != own)
+    return _grown(beside, len(beside), 2)[pairs]
 
 
 def check_signs(name: str, poisson: Array, group: Index) -> None:

@@ -8,10 +8,33 @@
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
 
+// The kernels for scenes with Poisson's ratio, which csrc/cuda/poisson compiles.
+namespace pd::poisson {
+template <class T>
+std::int64_t fused_bytes(const DeviceStep<T>& call);
+template <class T>
+void run_fused(const DeviceStep<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t stream_bytes(const DeviceStep<T>& call);
+template <class T>
+void run_stream(const DeviceStep<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t field_bytes(const DeviceField<T>& call);
+template <class T>
+void run_field(const DeviceField<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t conjugate_bytes(const DeviceConjugate<T>& call);
+template <class T>
+void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream stream);
+}  // namespace pd::poisson
+
 namespace pd {
 namespace {
 
 struct Cuda {
+  static constexpr bool sums_tets = false;  // in Field::effect_energy
+  static bool has_stencils(at::TensorList plan) { return has_device_stencils(plan); }
+
   template <class T>
   using Plan = DevicePlan<T>;
 
@@ -27,7 +50,6 @@ struct Cuda {
   template <class T>
   using Conjugate = Mixed<DeviceConjugate<T>>;
 
-  static constexpr bool sums_tets = false;
   template <class Call>
   static void view_stencils(Mixed<Call>& call, at::TensorList arrays, const Place& place) {
     call.stencils = device_stencils_view<typename Call::real>(arrays, call.plan.patches, place);
@@ -37,21 +59,44 @@ struct Cuda {
     return call.stencils.blocks > 0 ? call.stencils.stencil_sizes + stencil_size_count : nullptr;
   }
 
+  template <class Call>
+  static Call with_poisson(const Mixed<Call>& call) {
+    Call own = call;
+    own.poisson = call.effects.poisson;
+    return own;
+  }
+  template <class Call>
+  static bool is_mixed(const Mixed<Call>& call) {
+    TORCH_CHECK_NOT_IMPLEMENTED(
+        call.stencils.blocks == 0 || !call.effects.poisson.data,
+        "Poisson's ratio beside shells, threads or springs does not run on a GPU yet: "
+        "use device='cpu', or Solid(poisson=0)");
+    return call.stencils.blocks > 0;
+  }
+
   template <class T>
   static void step(const Step<T>& call, const Tensor& like) {
     const bool stream = call.plan.kernel == int(DeviceKernel::stream);
-    if (call.stencils.blocks > 0)
+    if (is_mixed(call))
       return run(like, call, mixed_step_bytes<T>,
                  stream ? run_mixed_stream<T> : run_mixed_block<T>);
-    run<DeviceStep<T>>(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
+    if (call.effects.poisson.data) {
+      const DeviceStep<T> own = with_poisson(call);
+      stream ? run<DeviceStep<T>>(like, own, poisson::stream_bytes<T>, poisson::run_stream<T>)
+             : run<DeviceStep<T>>(like, own, poisson::fused_bytes<T>, poisson::run_fused<T>);
+    } else {
+      run<DeviceStep<T>>(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
+    }
   }
 
   template <class T>
   static void field(const Field<T>& call, const Tensor& like) {
-    if (call.stencils.blocks > 0) return run(like, call, mixed_field_bytes<T>, run_mixed_field<T>);
+    if (is_mixed(call)) return run(like, call, mixed_field_bytes<T>, run_mixed_field<T>);
     // what belongs to effects is zero
     if (call.field == pd::Field::effect_energy || call.field == pd::Field::effect_products) return;
-    run<DeviceField<T>>(like, call, field_bytes<T>, run_field<T>);
+    call.effects.poisson.data
+        ? run(like, with_poisson(call), poisson::field_bytes<T>, poisson::run_field<T>)
+        : run<DeviceField<T>>(like, call, field_bytes<T>, run_field<T>);
   }
 
   template <class T>
@@ -67,9 +112,10 @@ struct Cuda {
 
   template <class T>
   static void conjugate(const Conjugate<T>& call, const Tensor& like) {
-    if (call.stencils.blocks > 0)
-      return run(like, call, mixed_conjugate_bytes<T>, run_mixed_conjugate<T>);
-    run<DeviceConjugate<T>>(like, call, conjugate_bytes<T>, run_conjugate<T>);
+    if (is_mixed(call)) return run(like, call, mixed_conjugate_bytes<T>, run_mixed_conjugate<T>);
+    call.effects.poisson.data
+        ? run(like, with_poisson(call), poisson::conjugate_bytes<T>, poisson::run_conjugate<T>)
+        : run<DeviceConjugate<T>>(like, call, conjugate_bytes<T>, run_conjugate<T>);
   }
 
   template <class T>

@@ -230,6 +230,7 @@ struct ElementsAcross {
   }
   PD_HD R weight(int s) const { return R::load(weights.weight + part(s).element()); }
   PD_HD R pressure(int s) const { return R::load(weights.pressure + part(s).element()); }
+  PD_HD WholeGroup lanes() const { return {}; }
   PD_HD R& sum(int s) const { return sums.part[place(s).part]; }
   PD_HD void add(int s, const Vec3<R> (&g)[4]) const {
     if constexpr (Members > 1) {
@@ -292,6 +293,7 @@ struct EnvironmentsAcross {
     const std::int64_t e = part(s).element();
     return weights.shared ? R(from[e]) : R::load(from + e * W);
   }
+  PD_HD WholeGroup lanes() const { return {}; }
   PD_HD R& sum(int s) const { return sums.part[place(s).part]; }
   PD_HD void add(int s, const Vec3<R> (&g)[4]) const {
     for (int c = 0; c < 4; ++c) forces[*part(s).corner(c)] = forces[*part(s).corner(c)] + g[c];

@@ -33,9 +33,6 @@ struct ComponentSums {
   bool tips, still;  // in some environment
 };
 
-// What the weights of tetrahedra are for: forces, the diagonal that cannot diverge, or the plain one.
-enum class WeightKind { force, majoriser, matrix };
-
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers
 
 template <class Lanes>
@@ -99,9 +96,7 @@ struct Workspace {
     }
     Lame<T> lame(youngs, effects.poisson.of(environment)[plan.tet_order[e]]);
     if (signed_bound < 0 && kind != WeightKind::matrix) lame.lambda = 0;
-    weight[at] = volume * (kind == WeightKind::majoriser ? lame.majoriser(bound)
-                           : kind == WeightKind::matrix  ? lame.matrix()
-                                                         : lame.twice_mu);
+    weight[at] = volume * lame.of(kind, bound);
     pressure[at] = volume * lame.lambda;
   }
 

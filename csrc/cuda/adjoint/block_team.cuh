@@ -6,7 +6,7 @@
 #include "cuda/common/teams.cuh"
 #include "cuda/multilevel/dense_solve.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Global memory of a team.
 template <class T>
@@ -340,4 +340,4 @@ class ConjugateTeam {
   bool direction_pending_ = false;
 };
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -3,7 +3,7 @@
 #include "cuda/adjoint/launch.cuh"
 #include "cuda/adjoint/one_block.cuh"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T>
 bool fits_one_block(const DeviceConjugate<T>& call) {
@@ -28,4 +28,4 @@ void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream to) {
                        : run_conjugate_teams(call, memory, stream);
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

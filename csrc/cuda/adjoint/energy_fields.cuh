@@ -5,23 +5,32 @@
 #include "cuda/common/reductions.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/slots.h"
+#include "cuda/elements/pair_weights.h"
 #include "cuda/elements/pairs_per_thread.h"
+#include "elements/solid_fields.h"
 #include "views/shared_memory.h"
 
-namespace pd {
+#include <stdexcept>
+
+namespace pd::inline PD_TARGET {
 
 constexpr int field_threads = 256;
+
+template <class T>
+PD_HD bool own_weights(const DeviceField<T>& field) {
+  return has_own_weights(field.stiffness, field.poisson);
+}
 
 template <class T>
 struct FieldWork {
   using real = T;
   DeviceField<T> field;
-  T* weights;             // [batch or 1, blocks, 2, 32] w V
+  T* weights;             // [batch or 1, blocks, pair_weights, 32]
   Quad<T>* shared_force;  // [batch or teams, slots]
 
   __device__ const T* weights_of(std::int64_t environment) const {
-    const std::int64_t own = field.stiffness.stride ? environment : 0;
-    return weights + own * field.plan.blocks * 2 * pair_lanes;
+    const std::int64_t own = own_weights(field) ? environment : 0;
+    return weights + own * field.plan.blocks * pair_weights * pair_lanes;
   }
 };
 
@@ -44,8 +53,12 @@ __global__ void __launch_bounds__(field_threads)
   const DevicePlan<T>& plan = work.field.plan;
   const std::int64_t set = blockIdx.x / plan.patches;
   const Patch<T> patch(plan, int(blockIdx.x % plan.patches));
-  compute_patch_weights(patch, rest_of<Computed>(patch), work.field.stiffness.of(set),
-                        work.field.weighted, work.weights + set * plan.blocks * 2 * pair_lanes);
+  const WeightKind kind = work.field.weighted                   ? WeightKind::majoriser
+                          : work.field.field == Field::diagonal ? WeightKind::matrix
+                                                                : WeightKind::force;
+  compute_patch_weights(patch, rest_of<Computed>(patch),
+                        Moduli<T>(work.field.stiffness, work.field.poisson, set), kind,
+                        work.weights + set * plan.blocks * pair_weights * pair_lanes);
 }
 
 // A patch of one environment in shared memory: positions relative to its first vertex and, with two
@@ -175,13 +188,56 @@ __global__ void __launch_bounds__(field_threads)
   }
 }
 
+// Numbers of every tetrahedron with Poisson's ratio, from element.run<N>(group, write).
+template <bool Computed, class Element, int Fields, int Numbers, class T>
+__global__ void __launch_bounds__(field_threads)
+    field_groups(const __grid_constant__ FieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const DevicePlan<T>& plan = work.field.plan;
+  const PatchFields<Fields, T> fields(work.field, shared);
+  const std::int64_t environment = fields.environment;
+  const Patch<T>& patch = fields.patch;
+  const T* weights = work.weights_of(environment);
+  const Moduli<T> moduli(work.field.stiffness, work.field.poisson, environment);
+  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
+    const PairPlace place = place_of(patch, number);
+    const PairInputs<T> inputs = load_pair(patch.plan, weights, place);
+    const auto numbers = rest_of<Computed>(patch).read(place, inputs);
+    Pair<T, Fields> pair;
+    for (int c = 0; c < 5; ++c) {
+      Vec3<T> vectors[Fields];
+      fields(inputs.corner[c], vectors);
+      for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
+    }
+    const auto write = [&](const auto& group, int s, const auto&... number) {
+      const int e = group.first + s, tet = plan.pair_tet[place.in(2) + e * pair_lanes];
+      if (tet < 0) return;
+      const T found[Numbers] = {number...};
+      T* to = work.field.out + (environment * plan.tets + tet) * Numbers;
+      for (int n = 0; n < Numbers; ++n) to[n] = found[n];
+      if constexpr (Numbers == 2) {
+        const T volume = e == 0 ? numbers.template weight<PairSide<T, 0>>(T(1))
+                                : numbers.template weight<PairSide<T, 1>>(T(1));
+        LameSlopes<T>(moduli.youngs[tet], moduli.poisson[tet]).chain(volume, to);
+      }
+    };
+    T unused = T(0);
+    each_group_of_pair(pair, numbers.face, inputs, plan.members,
+                       lanes_of_pair(plan.members, inputs.coupled, (number ^ 1) < patch.pairs),
+                       unused, [&](const auto& group) {
+                         constexpr int members = std::remove_cvref_t<decltype(group)>::members;
+                         Element{}.template run<members>(group, write);
+                       });
+  }
+}
+
 // `teams`: environments in progress at a time.
 template <class T>
 FieldWork<T> arrange(Arena& arena, const DeviceField<T>& field, std::int64_t teams) {
   const DevicePlan<T>& plan = field.plan;
   FieldWork<T> work{field, nullptr, nullptr};
   arena.place(work.weights,
-              (field.stiffness.stride ? field.batch : 1) * plan.blocks * 2 * pair_lanes);
+              (own_weights(field) ? field.batch : 1) * plan.blocks * pair_weights * pair_lanes);
   arena.place(work.shared_force, plan.shared ? teams * plan.slots : 0);
   return work;
 }
@@ -224,10 +280,28 @@ void run_vertices(const FieldWork<T>& work, cudaStream_t stream) {
 
 template <bool Computed, class T>
 void compute_field_weights(const FieldWork<T>& work, cudaStream_t stream) {
-  const std::int64_t sets = work.field.stiffness.stride ? work.field.batch : 1;
+  const std::int64_t sets = own_weights(work.field) ? work.field.batch : 1;
   field_weights<Computed, T>
       <<<blocks_of(sets * work.field.plan.patches), field_threads, 0, stream>>>(work);
   check(cudaGetLastError());
+}
+
+template <bool Computed, class T>
+void run_elements(const FieldWork<T>& work, cudaStream_t stream) {
+  const DeviceField<T>& field = work.field;
+  const bool product = field.field == Field::element_energy_product;
+  if constexpr (!has_poisson_ratio) {
+    return product ? launch_field(field_elements<Computed, true, T>, work, 2, stream)
+                   : launch_field(field_elements<Computed, false, T>, work, 1, stream);
+  } else if (field.field == Field::element_energy) {
+    return launch_field(field_groups<Computed, ElementEnergy, 1, 1, T>, work, 1, stream);
+  } else if (product) {
+    return launch_field(field_groups<Computed, ElementEnergyProduct, 2, 1, T>, work, 2, stream);
+  } else if (field.direction) {
+    return launch_field(field_groups<Computed, LameProduct, 2, 2, T>, work, 2, stream);
+  } else {
+    return launch_field(field_groups<Computed, LameSlope, 1, 2, T>, work, 1, stream);
+  }
 }
 
 template <bool Computed, class T>
@@ -244,9 +318,9 @@ void run_field_with(const FieldWork<T>& work, cudaStream_t stream) {
     case Field::hessian_product:
       return run_vertices<Computed, SolidHessian, 2, 3>(work, stream);
     case Field::element_energy:
-      return launch_field(field_elements<Computed, false, T>, work, 1, stream);
     case Field::element_energy_product:
-      return launch_field(field_elements<Computed, true, T>, work, 2, stream);
+    case Field::lame_product:
+      return run_elements<Computed>(work, stream);
     default:
       return;  // only run_mixed_field has the others
   }
@@ -285,4 +359,4 @@ void run_rotation(const RotationCall<T>& call, Stream to) {
   check(cudaGetLastError());
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -3,7 +3,7 @@
 #include "cuda/adjoint/block_team.cuh"
 #include "solver/adjoint/friction.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class Work, bool WithLevels, bool Computed>
 class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
@@ -223,4 +223,4 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
   PartialSums<Add, 2> products_{m_.products, Base::curvature_.count};
 };
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

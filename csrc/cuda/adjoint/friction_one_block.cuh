@@ -4,7 +4,7 @@
 #include "cuda/adjoint/sums.cuh"
 #include "solver/adjoint/friction.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Vectors of BiCGStab, [batch, vertices, 3]; its p is stored in the direction.
 template <class T>
@@ -138,4 +138,4 @@ class FrictionBlock {
   const T *inertia_, *inverse_;
 };
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -4,7 +4,7 @@
 
 #include <type_traits>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Arrays of one team; arrays per environment are not offset.
 template <class T>
@@ -155,4 +155,4 @@ void run_conjugate_teams(const DeviceConjugate<T>& call, void* memory, cudaStrea
   launch_solve(launch, work, stream);
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

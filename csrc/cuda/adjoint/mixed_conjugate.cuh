@@ -3,7 +3,7 @@
 #include "cuda/adjoint/conjugate_gradients.cuh"
 #include "cuda/common/stencil_numbers.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T>
 struct MixedConjugateBlock : ConjugateBlock<T> {
@@ -81,4 +81,4 @@ void run_mixed_conjugate(const MixedConjugate<T>& call, void* memory, Stream to)
   launch_solve(launch, work, stream);
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

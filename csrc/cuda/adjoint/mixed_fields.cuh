@@ -3,7 +3,7 @@
 #include "cuda/adjoint/sums.cuh"
 #include "cuda/common/stencil_numbers.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T>
 struct MixedFieldWork : FieldWork<T> {
@@ -215,4 +215,4 @@ void run_mixed_field(const MixedField<T>& field, void* memory, Stream to) {
   }
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -7,7 +7,7 @@
 
 #include <algorithm>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T>
 struct ConjugateBlock {
@@ -182,4 +182,4 @@ void run_conjugate_block(const DeviceConjugate<T>& call, void* memory, cudaStrea
   launch_block(work, call.plan.most_pairs, stream);
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -5,7 +5,7 @@
 #include "cuda/common/block_team.h"
 #include "solver/adjoint/conjugate_gradients.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Threads of a block that has a multiprocessor to itself, limited by registers.
 template <class T>
@@ -93,10 +93,11 @@ DeviceField<T> conjugate_field(const DeviceConjugate<T>& call) {
   field.plan = call.plan;
   field.field = Field::hessian_product;
   field.stiffness = call.stiffness;
+  field.poisson = call.poisson;
   field.batch = call.batch;
   field.positions = call.positions;
   field.direction = call.direction;
   return field;
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -4,7 +4,7 @@
 #include "solver/adjoint/contact_gradients.h"
 #include "solver/adjoint/system.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Calls visit(vertex), one thread per vertex.
 template <class T, class Visit>
@@ -82,4 +82,4 @@ void run_adjoint_result(const AdjointResultCall<T>& call, Stream to) {
   run_for_each(adjoint_result<T>, call, call.batch * call.vertices, to);
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -1,6 +1,7 @@
 // Entry points of the kernels, without torch or CUDA headers. The caller owns the memory; calls
 // enqueue work on a stream and return.
 #pragma once
+#include "math/config.h"
 #include "views/vertex_sum.h"
 #include "views/views.h"
 
@@ -39,6 +40,37 @@ bool has_free_pieces(const DeviceStep<T>& call) {
   return call.plan.pieces > 0;
 }
 
+template <class T>
+using DeviceField = FieldCall<T, DevicePlan<T>>;
+
+template <class T>
+using DeviceConjugate = ConjugateCall<T, DevicePlan<T>>;
+
+template <class T>
+using DeviceAdjointSystem = AdjointSystemCall<T, DevicePlan<T>>;
+
+template <class T>
+using DeviceContactGradients = ContactGradientsCall<T, DevicePlan<T>>;
+
+template <class T>
+using DeviceReport = ReportCall<T, DevicePlan<T>>;
+
+// The same for scenes with stencils.
+template <class T>
+using MixedStep = Mixed<DeviceStep<T>>;
+template <class T>
+using MixedField = Mixed<DeviceField<T>>;
+template <class T>
+using MixedConjugate = Mixed<DeviceConjugate<T>>;
+
+// Blocks of the largest cluster that the current device runs; 1 when the device or this build
+// supports none.
+int largest_cluster();
+
+}  // namespace pd
+
+namespace pd::inline PD_TARGET {
+
 // Device memory in bytes, aligned to 256. Fused covers the kernels block, cluster and grid.
 template <class T>
 std::int64_t fused_bytes(const DeviceStep<T>& call);
@@ -53,19 +85,12 @@ std::int64_t small_batch_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_small_batch(const DeviceStep<T>& call, void* memory, Stream stream);
 
-// Blocks of the largest cluster that the current device runs; 1 when the device or this build
-// supports none.
-int largest_cluster();
-
 template <class T>
 std::int64_t stream_bytes(const DeviceStep<T>& call);
 template <class T>
 void run_stream(const DeviceStep<T>& call, void* memory, Stream stream);
 
 // The same for scenes with stencils, by the kernels block and stream.
-template <class T>
-using MixedStep = Mixed<DeviceStep<T>>;
-
 template <class T>
 std::int64_t mixed_block_bytes(const MixedStep<T>& call);
 template <class T>
@@ -87,12 +112,6 @@ std::int64_t step_bytes(const DeviceStep<T>& call) {
 }
 
 template <class T>
-using DeviceField = FieldCall<T, DevicePlan<T>>;
-
-template <class T>
-using MixedField = Mixed<DeviceField<T>>;
-
-template <class T>
 std::int64_t field_bytes(const DeviceField<T>& call);
 template <class T>
 void run_field(const DeviceField<T>& call, void* memory, Stream stream);
@@ -100,12 +119,6 @@ template <class T>
 std::int64_t mixed_field_bytes(const MixedField<T>& call);
 template <class T>
 void run_mixed_field(const MixedField<T>& call, void* memory, Stream stream);
-
-template <class T>
-using DeviceConjugate = ConjugateCall<T, DevicePlan<T>>;
-
-template <class T>
-using MixedConjugate = Mixed<DeviceConjugate<T>>;
 
 template <class T>
 std::int64_t conjugate_bytes(const DeviceConjugate<T>& call);
@@ -117,13 +130,7 @@ template <class T>
 void run_mixed_conjugate(const MixedConjugate<T>& call, void* memory, Stream stream);
 
 template <class T>
-using DeviceAdjointSystem = AdjointSystemCall<T, DevicePlan<T>>;
-
-template <class T>
 void run_adjoint_system(const DeviceAdjointSystem<T>& call, Stream stream);
-
-template <class T>
-using DeviceContactGradients = ContactGradientsCall<T, DevicePlan<T>>;
 
 template <class T>
 void run_contact_gradients(const DeviceContactGradients<T>& call, Stream stream);
@@ -131,9 +138,6 @@ template <class T>
 void run_adjoint_result(const AdjointResultCall<T>& call, Stream stream);
 template <class T>
 void run_vertex_sum(const VertexSumCall<T>& call, Stream stream);
-
-template <class T>
-using DeviceReport = ReportCall<T, DevicePlan<T>>;
 
 template <class T>
 void run_report(const DeviceReport<T>& call, Stream stream);
@@ -146,4 +150,4 @@ void run_precondition(const PreconditionCall<T>& call, void* memory, Stream stre
 template <class T>
 void run_rotation(const RotationCall<T>& call, Stream stream);
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -5,7 +5,7 @@
 #include "cuda/common/runtime.h"
 #include "solver/report.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Sums over a block's threads; thread 0 gets the result.
 PD_DEVICE void block_reduce_sums(double (&sum)[report_sums]) {
@@ -60,4 +60,4 @@ void run_report(const DeviceReport<T>& call, Stream to) {
   check(cudaGetLastError());
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

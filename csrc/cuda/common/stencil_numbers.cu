@@ -2,7 +2,7 @@
 
 #include "cuda/common/runtime.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 constexpr int number_threads = 256;
 
@@ -43,4 +43,4 @@ template void compute_stencil_numbers(const StencilWork<float>&, const Effects<f
 template void compute_stencil_numbers(const StencilWork<double>&, const Effects<double>&,
                                       std::int64_t, cudaStream_t);
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -5,7 +5,7 @@
 
 #include <cuda_runtime.h>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Places the numbers: of every environment, or one set where all share their rows.
 template <class T>
@@ -22,4 +22,4 @@ template <class T>
 void compute_stencil_numbers(const StencilWork<T>& work, const Effects<T>& effects,
                              std::int64_t batch, cudaStream_t stream);
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -8,7 +8,7 @@
 
 #include <algorithm>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T>
 PD_HD void arrange(Arena& arena, const Levels<T>& levels, int teams, CycleMemory<T>& m) {
@@ -52,4 +52,4 @@ void launch_teams(const void* kernel, Call& call, unsigned* counter, int threads
                                     arguments, shared, stream));
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -6,6 +6,7 @@
 // same bits.
 #pragma once
 #include "cuda/common/memory.h"
+#include "cuda/elements/group_lanes.h"
 #include "elements/solid.h"
 #include "views/views.h"
 
@@ -100,9 +101,18 @@ PD_DEVICE PairPlace place_of(const Patch<T>& patch, int pair) {
   return {unsigned(patch.first_block) * pair_lanes + unsigned(pair)};
 }
 
+// V lambda of both tetrahedra; nothing without Poisson's ratio.
+template <class T, bool There = has_poisson_ratio>
+struct PairPressure {};
+template <class T>
+struct PairPressure<T, true> {
+  T pressure[2];
+  bool coupled;
+};
+
 // Corners and weights of a pair; its rest shape is loaded separately.
 template <class T>
-struct PairInputs {
+struct PairInputs : PairPressure<T> {
   unsigned corner[5];
   T weight[2];
 
@@ -118,7 +128,14 @@ PD_DEVICE PairInputs<T> load_pair(const DevicePlan<T>& plan, const T* weights, P
   for (int c = 0; c < 5; ++c) numbers.corner[c] = unsigned(corner[c * pair_lanes]);
   for (int e = 0; e < 2; ++e) {
     numbers.weight[e] = T(0);
-    if constexpr (WithWeights) numbers.weight[e] = (weights + place.in(2))[e * pair_lanes];
+    if constexpr (WithWeights)
+      numbers.weight[e] = (weights + place.in(pair_weights))[e * pair_lanes];
+  }
+  if constexpr (WithWeights && has_poisson_ratio) {
+    numbers.coupled = has_sign(numbers.weight[0]);
+    numbers.weight[0] = absolute(numbers.weight[0]);
+    for (int e = 0; e < 2; ++e)
+      numbers.pressure[e] = (weights + place.in(pair_weights))[(2 + e) * pair_lanes];
   }
   return numbers;
 }
@@ -288,6 +305,47 @@ struct PairElement {
   PD_HD void add(int, const Vec3<R> (&g)[4]) const { Side::add(pair, g); }
 };
 
+// The same of a pair in a group, or of one of its tetrahedra that is a group of its own.
+template <class T, int Fields, int Members, class Lanes>
+struct PairGroup {
+  static constexpr int members = Members;
+  using R = T;
+  Pair<T, Fields>& pair;
+  const FaceRest<T, 2>& face;
+  const PairInputs<T>& numbers;
+  Lanes exchange;
+  int first;  // tetrahedron of the pair
+  T& energy;
+
+  PD_HD void corners(int s, int field, Vec3<R> (&x)[4]) const {
+    for (int c = 0; c < 3; ++c) x[c] = pair.corner[field][c];
+    x[3] = pair.corner[field][3 + first + s];
+  }
+  PD_HD Mat3<R> rest(int s) const { return face.inverse(first + s); }
+  PD_HD R weight(int s) const { return numbers.weight[first + s]; }
+  PD_HD R pressure(int s) const { return numbers.pressure[first + s]; }
+  PD_HD const Lanes& lanes() const { return exchange; }
+  PD_HD R& sum(int) const { return energy; }
+  PD_HD void add(int s, const Vec3<R> (&g)[4]) const {
+    const bool second = first + s == 1;
+    for (int c = 0; c < 3; ++c) pair.force[c] = second ? pair.force[c] + g[c] : g[c];
+    pair.force[3 + first + s] = g[3];
+  }
+};
+
+// An element functor of a pair with Poisson's ratio: visit(group) for the whole pair, or for each of its tetrahedra.
+template <class T, int Fields, class Lanes, class Visit>
+PD_DEVICE void each_group_of_pair(Pair<T, Fields>& pair, const FaceRest<T, 2>& face,
+                                  const PairInputs<T>& numbers, int members, const Lanes& lanes,
+                                  T& energy, const Visit& visit) {
+  if (members == 1) {
+    for (int e = 0; e < 2; ++e)
+      visit(PairGroup<T, Fields, 1, WholeGroup>{pair, face, numbers, {}, e, energy});
+  } else {
+    visit(PairGroup<T, Fields, 2, Lanes>{pair, face, numbers, lanes, 0, energy});
+  }
+}
+
 // Writes a force to its entry. The fourth component is never read, so it takes whatever the
 // register holds.
 template <class T>
@@ -299,7 +357,9 @@ PD_DEVICE void write_entry(const Vec3<T>& force, Quad<T>& entry) {
 // vectors)` loads the vectors of a corner's slot, encoded as in pair_corner.
 template <int Fields, class T, class Read, class Shape, class Element>
 PD_DEVICE void process_pair(const Read& read, const Shape& shape, const PairInputs<T>& numbers,
-                            Quad<T>* entries, const Element& element, T& energy) {
+                            Quad<T>* entries, const Element& element, T& energy,
+                            [[maybe_unused]] int members = 1,
+                            [[maybe_unused]] bool neighbour = false) {
   using First = PairSide<T, 0>;
   using Second = PairSide<T, 1>;
   Pair<T, Fields> pair;
@@ -308,7 +368,17 @@ PD_DEVICE void process_pair(const Read& read, const Shape& shape, const PairInpu
     read(numbers.corner[c], vectors);
     for (int f = 0; f < Fields; ++f) pair.corner[f][c] = vectors[f];
   }
-  if constexpr (OnFaces<Element>) {
+  if constexpr (has_poisson_ratio && !ReadsWeightsAlone<Element>) {
+    const auto lanes = lanes_of_pair(members, numbers.coupled, neighbour);
+    if constexpr (OnFaces<Element>) {
+      element.run_group(pair.corner[0], shape.face, numbers.weight, numbers.pressure, members == 1,
+                        lanes, pair.force, energy);
+    } else {
+      each_group_of_pair(pair, shape.face, numbers, members, lanes, energy, [&](const auto& group) {
+        element.template run<std::remove_cvref_t<decltype(group)>::members>(group);
+      });
+    }
+  } else if constexpr (OnFaces<Element>) {
     element.run_face(pair.corner[0], shape.face, numbers.weight, pair.force, energy);
   } else {
     element.template run<1>(
@@ -332,51 +402,16 @@ PD_DEVICE T each_pair(const Patch<T>& patch, const Read& read, const Rest& rest,
   PairInputs<T> now = read_numbers(threadIdx.x);
   for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
     const typename Rest::Numbers shape = rest.read(place_of(patch, number), now);
-    process_pair<Fields>(read, shape, now, entries, element, energy);
+    if constexpr (has_poisson_ratio) {
+      process_pair<Fields>(read, shape, now, entries, element, energy, patch.plan.members,
+                           (number ^ 1) < patch.pairs);
+    } else {
+      process_pair<Fields>(read, shape, now, entries, element, energy);
+    }
     // loading here instead of at the top of the loop spills fewer registers
     now = read_numbers(number + int(blockDim.x));
   }
   return energy;
-}
-
-// w V of both tetrahedra of a pair, times l_e if `bounded`.
-template <class T, class Rest>
-PD_DEVICE void compute_pair_weights(const DevicePlan<T>& plan, const Rest& rest, PairPlace place,
-                                    const T* stiffness, bool bounded, T* weights) {
-  const typename Rest::Numbers numbers =
-      rest.read(place, load_pair<false, T>(plan, nullptr, place));
-  const auto compute = [&](auto side) {
-    using Side = decltype(side);
-    const unsigned at = place.in(2) + Side::which * pair_lanes;
-    const int tet = tet_of(plan, place, Side::which);
-    const T bound = bounded ? plan.pair_bound[at] : T(1);
-    weights[at] = tet < 0 ? T(0) : bound * numbers.template weight<Side>(stiffness[tet]);
-  };
-  compute(PairSide<T, 0>{});
-  compute(PairSide<T, 1>{});
-}
-
-// The same for all pairs of a patch.
-template <class T, class Rest>
-PD_DEVICE void compute_patch_weights(const Patch<T>& patch, const Rest& rest, const T* stiffness,
-                                     bool bounded, T* weights) {
-  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x)
-    compute_pair_weights(patch.plan, rest, place_of(patch, number), stiffness, bounded, weights);
-}
-
-// The common stiffness of a patch's tetrahedra, or -1 if they differ. All threads of the block must
-// call it.
-template <class T>
-PD_DEVICE T one_stiffness(const Patch<T>& patch, const T* stiffness) {
-  const T first = stiffness[tet_of(patch.plan, place_of(patch, 0), 0)];
-  bool same = true;
-  for (int number = threadIdx.x; number < patch.pairs; number += blockDim.x) {
-    for (int e = 0; e < 2; ++e) {
-      const int tet = tet_of(patch.plan, place_of(patch, number), e);
-      same = same && (tet < 0 || stiffness[tet] == first);
-    }
-  }
-  return __syncthreads_and(same) ? first : T(-1);
 }
 
 template <class T>

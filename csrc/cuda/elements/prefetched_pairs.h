@@ -34,7 +34,12 @@ PD_DEVICE T each_prefetched_pair(const Patch<T>& patch, const Quad<T>* position,
     const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) { x[0] = at_corner(position, corner); };
     const int next = number + int(blockDim.x);
     now = prefetch_pair(patch, weights, next < patch.pairs ? next : int(threadIdx.x));
-    process_pair<1>(read, pair.rest, pair.numbers, entries, element, energy);
+    if constexpr (has_poisson_ratio) {
+      process_pair<1>(read, pair.rest, pair.numbers, entries, element, energy, patch.plan.members,
+                      (number ^ 1) < end);
+    } else {
+      process_pair<1>(read, pair.rest, pair.numbers, entries, element, energy);
+    }
   }
   __syncwarp();
   return energy;

@@ -9,8 +9,16 @@
 namespace pd::inline PD_TARGET {
 
 // Corners and weight of a lane's tetrahedron; even lanes hold the first tetrahedron of a pair.
+template <class T, bool There = has_poisson_ratio>
+struct TetPressure {};
 template <class T>
-struct TetInputs {
+struct TetPressure<T, true> {
+  T pressure;    // V lambda
+  bool coupled;  // whether its pair averages with a neighbour
+};
+
+template <class T>
+struct TetInputs : TetPressure<T> {
   unsigned corner[4];  // 8 times the slot, plus 65536 times the entry
   T weight, factor;    // w V; pair_factor where rest shapes are computed
 
@@ -35,7 +43,15 @@ PD_DEVICE TetInputs<T> load_tet(const Patch<T>& patch, const T* weights, int num
   numbers.corner[3] = corner(3 + which);
   const unsigned own = of_two + which * pair_lanes;
   numbers.weight = T(0);
-  if constexpr (WithWeights) numbers.weight = weights[own];
+  if constexpr (WithWeights && has_poisson_ratio) {
+    const unsigned first = place_of(patch, int(pair)).in(pair_weights);
+    const T sign = weights[first];
+    numbers.coupled = has_sign(sign);
+    numbers.weight = absolute(weights[first + which * pair_lanes]);
+    numbers.pressure = weights[first + (2 + which) * pair_lanes];
+  } else if constexpr (WithWeights) {
+    numbers.weight = weights[own];
+  }
   numbers.factor = T(1);
   if constexpr (Computed) numbers.factor = patch.plan.pair_factor[own];
   return numbers;
@@ -115,7 +131,11 @@ PD_DEVICE T each_tet(const Patch<T>& patch, const Slots& slots, const ShapeOf& s
     for (int c = 0; c < 4; ++c) x[c] = vec3(loaded[c]);
     T tet_energy = T(0);
     const FaceRest<T, 1> rest = shape_of(first + lane, now, loaded);
-    if constexpr (OnFaces<Element>) {
+    if constexpr (OnFaces<Element> && has_poisson_ratio) {
+      const int members = patch.plan.members;
+      element.run_group(x, rest, {now.weight}, {now.pressure}, members == 1,
+                        lanes_of_tet(members, now.coupled), force, tet_energy);
+    } else if constexpr (OnFaces<Element>) {
       element.run_face(x, rest, {now.weight}, force, tet_energy);
     } else {
       element.template run<1>(TetElement<T>{rest.inverse(0), now.weight, force});

@@ -22,7 +22,7 @@ constexpr int block_arrays = 4;
 template <class T>
 struct FusedScratch {
   Quad<T>* vertex[vertex_arrays];  // [teams, slots]; arrays outside shared memory
-  T* weights;                      // [teams, blocks, 2, 32] w V
+  T* weights;                      // [teams, blocks, pair_weights, 32]
   Piece<T>* pieces;                // [teams, patches, pieces]
   // [teams, parts, PartSums::count]; a part holds the vertices of a piece that a patch owns
   double* part_sum;

@@ -7,7 +7,7 @@
 #include "cuda/fused/visit.h"
 #include "views/shared_memory.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Threads of a block that has a multiprocessor to itself: the maximum, and the number that leaves
 // registers for prefetched data.
@@ -37,7 +37,9 @@ using FusedKernel = void (*)(FusedCall<T>);
 template <class T, bool HasContacts, bool HasFreePieces>
 FusedKernel<T> fused_kernel_for(Blocks kind, bool in_shared, int threads) {
   constexpr int most = most_grid_threads<T>;
-  if (kind == Blocks::cluster) {
+  if constexpr (has_poisson_ratio) {
+    if (kind == Blocks::cluster) return nullptr;  // a group may lie in two patches of a cluster
+  } else if (kind == Blocks::cluster) {
     constexpr int few = most * 5 / 8;  // leaves more registers per thread
     if (threads <= few) {
       if (in_shared) return fused_step<T, HasContacts, HasFreePieces, Blocks::cluster, true, few>;
@@ -55,4 +57,4 @@ FusedKernel<T> fused_kernel_for(Blocks kind, bool in_shared, int threads) {
   return fused_step<T, HasContacts, HasFreePieces, Blocks::one, false, resident_threads<T>>;
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -11,7 +11,7 @@
 #include <string>
 #include <tuple>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 static_assert(sizeof(Control<double>) <= fused_control_bytes);
 static_assert(sizeof(Plane<float>) == planes_numbers * sizeof(float) &&
@@ -27,6 +27,10 @@ extern template FusedKernel<double> fused_kernel_for<double, true, true>(Blocks,
 template <class T>
 FusedKernel<T> fused_kernel(const DeviceStep<T>& step, Blocks kind, bool in_shared, int threads) {
   if (has_contacts(step)) return fused_kernel_for<T, true, true>(kind, in_shared, threads);
+  // fewer kernels with Poisson's ratio
+  if constexpr (has_poisson_ratio)
+    return has_free_pieces(step) ? fused_kernel_for<T, true, true>(kind, in_shared, threads)
+                                 : fused_kernel_for<T, false, false>(kind, in_shared, threads);
   return has_free_pieces(step) ? fused_kernel_for<T, false, true>(kind, in_shared, threads)
                                : fused_kernel_for<T, false, false>(kind, in_shared, threads);
 }
@@ -149,6 +153,10 @@ FusedLaunch<T>::FusedLaunch(const DeviceStep<T>& step)
                                                           : Blocks::one),
       patches(kind == Blocks::one ? 1 : step.plan.patches) {
   if (kind == Blocks::cluster) {
+    if constexpr (has_poisson_ratio)
+      throw std::invalid_argument(
+          "torchpd: kernel \"cluster\" has no Poisson's ratio; build the simulator with "
+          "kernel=\"grid\", or leave kernel to \"auto\"");
     form_clusters(step);
     return;
   }
@@ -232,7 +240,7 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const Launch& l
   }
   // with one tetrahedron per thread, its weight stays in a register
   const bool own = launch.kind == Blocks::cluster && near_once(sizeof(T));
-  arena.place(s.weights, own ? 0 : teams * plan.blocks * 2 * pair_lanes);
+  arena.place(s.weights, own ? 0 : teams * plan.blocks * pair_weights * pair_lanes);
   arena.place(s.pieces, teams * launch.patches * plan.pieces);
   arena.place(s.part_sum, teams * plan.parts * PartSums::count);
   return s;
@@ -240,7 +248,7 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const Launch& l
 
 template <class T>
 std::int64_t fused_bytes(const DeviceStep<T>& step) {
-  if constexpr (sizeof(T) == 4)
+  if constexpr (sizeof(T) == 4 && !has_poisson_ratio)
     if (takes_small_batch(step)) return small_batch_bytes(step);
   Arena arena(nullptr);
   arrange(arena, step, FusedLaunch<T>(step));
@@ -249,7 +257,7 @@ std::int64_t fused_bytes(const DeviceStep<T>& step) {
 
 template <class T>
 void run_fused(const DeviceStep<T>& step, void* memory, Stream to) {
-  if constexpr (sizeof(T) == 4)
+  if constexpr (sizeof(T) == 4 && !has_poisson_ratio)
     if (takes_small_batch(step)) return run_small_batch(step, memory, to);
   const auto stream = static_cast<cudaStream_t>(to);
   const FusedLaunch<T> launch(step);
@@ -269,4 +277,4 @@ void run_fused(const DeviceStep<T>& step, void* memory, Stream to) {
              launch.kind == Blocks::cluster ? launch.patches : 0, stream);
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -2,7 +2,7 @@
 #pragma once
 #include "cuda/fused/kernels.cuh"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T, bool HasContacts, bool HasFreePieces, bool InShared>
 __global__ void __launch_bounds__(resident_threads<T>, 1)
@@ -21,4 +21,4 @@ MixedKernel<T> mixed_kernel_for(bool in_shared) {
                    : mixed_step<T, HasContacts, HasFreePieces, false>;
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

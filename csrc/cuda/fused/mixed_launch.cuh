@@ -4,7 +4,7 @@
 #include "cuda/fused/launch.cuh"
 #include "cuda/fused/mixed_kernels.cuh"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // instantiated in mixed_contacts_float.cu and mixed_contacts_double.cu
 extern template MixedKernel<float> mixed_kernel_for<float, true, true>(bool);
@@ -69,4 +69,4 @@ void run_mixed_block(const MixedStep<T>& step, void* memory, Stream to) {
                          arguments, launch.shared, stream));
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

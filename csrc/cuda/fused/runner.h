@@ -11,6 +11,7 @@
 // vertices, and sends the new positions of these vertices.
 #pragma once
 #include "cuda/common/vertices.h"
+#include "cuda/elements/pair_weights.h"
 #include "cuda/elements/pairs_per_thread.h"
 #include "cuda/elements/prefetched_pairs.h"
 #include "cuda/elements/stencils.h"
@@ -212,7 +213,7 @@ class FusedRunner {
     return std::int64_t(team_) * plan_.slots + patch_.first_slot;
   }
   PD_DEVICE T* weights() const {
-    return memory_.weights + std::int64_t(team_) * plan_.blocks * 2 * pair_lanes;
+    return memory_.weights + std::int64_t(team_) * plan_.blocks * pair_weights * pair_lanes;
   }
   PD_DEVICE Piece<T>& piece(int piece) const {
     return memory_.pieces[(std::int64_t(team_) * plan_.patches + index_) * plan_.pieces + piece];
@@ -429,7 +430,7 @@ class FusedRunner {
   PD_DEVICE void load();
   PD_DEVICE void move_spheres();
   PD_DEVICE void assemble_diagonal();
-  PD_DEVICE void compute_weights(const T* stiffness, bool bounded);
+  PD_DEVICE void compute_weights(const Moduli<T>& moduli, WeightKind kind);
   PD_DEVICE T compute_own_weight(const T* stiffness, bool bounded);
   PD_DEVICE void load_own();
 

@@ -94,13 +94,13 @@ template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InSha
           bool HasStencils>
 PD_DEVICE void
 FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::assemble_diagonal() {
-  const T* stiffness = call_.material.stiffness.of(in_.environment);
+  const Moduli<T> moduli(call_.material.stiffness, call_.poisson, in_.environment);
   constexpr bool own = Clustered && OnePerThread;
   T plain = T(0);
   if constexpr (own) {
-    plain = compute_own_weight(stiffness, set_.weighted);
+    plain = compute_own_weight(moduli.youngs, set_.weighted);
   } else {
-    compute_weights(stiffness, set_.weighted);
+    compute_weights(moduli, set_.weighted ? WeightKind::majoriser : WeightKind::matrix);
   }
   if (threadIdx.x == 0) control_.progress.done = false;
   pending_ = false;
@@ -115,8 +115,8 @@ FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::assembl
   if (threadIdx.x == 0) control_.progress.min_share = sums_.total(0);
   if constexpr (own) {
     tet_.weight = plain;
-  } else if (set_.weighted) {
-    compute_weights(stiffness, false);
+  } else if (set_.weighted || has_poisson_ratio) {
+    compute_weights(moduli, WeightKind::force);
   }
   __syncthreads();
 }
@@ -124,8 +124,8 @@ FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::assembl
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
           bool HasStencils>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
-                           HasStencils>::compute_weights(const T* stiffness, bool bounded) {
-  compute_patch_weights(patch_, rest_of<false>(patch_), stiffness, bounded, weights());
+                           HasStencils>::compute_weights(const Moduli<T>& moduli, WeightKind kind) {
+  compute_patch_weights(patch_, rest_of<false>(patch_), moduli, kind, weights());
   __syncthreads();  // one lane has written the weights of two
   if constexpr (Many) load_own();
 }

@@ -7,7 +7,7 @@
 #include "cuda/stream/multilevel_interface.h"
 #include "views/shared_memory.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 static_assert(sizeof(MultilevelControl) + pass_static_bytes <= outer_static_bytes);
 static_assert(sizeof(MultilevelControl::warp_dot) >= 4 * multilevel_warps * sizeof(Quad<double>));
@@ -40,8 +40,8 @@ __global__ void __launch_bounds__(multilevel_threads)
   Range* const ranges = of_team(call, number).ranges;
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
     const StreamWork<T, false> w(call.stream, e);
-    const T* stiffness = call.stream.step.material.stiffness.of(e);
-    MismatchRunner<T> run(w, stiffness, ranges, team);
+    const DeviceStep<T>& step = call.stream.step;
+    MismatchRunner<T> run(w, {step.material.stiffness, step.poisson, e}, ranges, team);
     const MaterialMismatch mismatch = measure_mismatch(run, w.plan.levels);
     if (team.thread() == 0) call.memory.mismatch[e] = mismatch;
   }
@@ -247,4 +247,4 @@ void run_precondition(const PreconditionCall<T>& op, void* memory, Stream stream
                multilevel_threads, 0, static_cast<cudaStream_t>(stream));
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -8,14 +8,20 @@ namespace pd::inline PD_TARGET {
 template <class T>
 class MismatchRunner {
  public:
-  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, const T* stiffness, Range* memory,
+  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, const Moduli<T>& moduli, Range* memory,
                            BlockTeam& team)
-      : w_(w), stiffness_(stiffness), memory_(memory), team_(team) {}
+      : w_(w), moduli_(moduli), memory_(memory), team_(team) {}
 
   template <class Visit>
   PD_DEVICE void each_element(const Visit& visit) const {
 #pragma unroll 1
-    for (int t = team_.thread(); t < w_.plan.tets; t += team_.threads()) visit(stiffness_[t], t);
+    for (int t = team_.thread(); t < w_.plan.tets; t += team_.threads()) {
+      if constexpr (has_poisson_ratio) {
+        visit(Lame<T>(moduli_.youngs[t], moduli_.poisson[t]).matrix(), t);
+      } else {
+        visit(moduli_.youngs[t], t);
+      }
+    }
   }
 
   template <class Visit>
@@ -55,7 +61,7 @@ class MismatchRunner {
 
  private:
   const StreamWork<T, false>& w_;
-  const T* stiffness_;
+  Moduli<T> moduli_;
   Range* memory_;
   BlockTeam& team_;
   int round_ = 0;

@@ -5,7 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Threads that fit in a multiprocessor's registers: by default, and with so few registers each that
 // some spill.
@@ -111,4 +111,4 @@ std::int64_t most_at_work(const SmallMesh& mesh, const DeviceLimits& limits, con
   return most;
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -8,7 +8,7 @@
 
 #include <algorithm>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T, bool HasContacts, bool HasFreePieces, bool OnePerThread, bool FewRegisters>
 __global__ void __launch_bounds__(FewRegisters ? few_registers_threads : small_batch_threads, 1)
@@ -117,4 +117,4 @@ void run_small_batch(const DeviceStep<T>& step, void* memory, Stream stream) {
                          static_cast<cudaStream_t>(stream)));
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

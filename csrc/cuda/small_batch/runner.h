@@ -7,6 +7,7 @@
 #pragma once
 #include "cuda/common/team.h"
 #include "cuda/common/vertices.h"
+#include "cuda/elements/pair_weights.h"
 #include "cuda/elements/pairs_per_thread.h"
 #include "cuda/rigid/rounds.h"
 #include "cuda/small_batch/call.h"
@@ -349,9 +350,10 @@ class SmallBatchRunner {
     const StoredRest<T> rest{plan_.pair_rest};
     for (WorkItem item = first_pair_; item.environment < here_;
          item = after(item, pairs(), pair_stride_))
-      compute_pair_weights(plan_, rest, PairPlace{unsigned(item.at)},
-                           call_.material.stiffness.of(first_ + item.environment), bounded,
-                           weights(item.environment));
+      compute_pair_weights(
+          plan_, rest, PairPlace{unsigned(item.at)},
+          Moduli<T>(call_.material.stiffness, call_.poisson, first_ + item.environment),
+          bounded ? WeightKind::majoriser : WeightKind::force, weights(item.environment));
     // each thread reads only weights that it wrote itself
     prefetch_pair(first_pair_);
   }

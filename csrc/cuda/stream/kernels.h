@@ -3,6 +3,7 @@
 #pragma once
 #include "cuda/common/reductions.h"
 #include "cuda/common/vertices.h"
+#include "cuda/elements/pair_weights.h"
 #include "cuda/elements/stencils.h"
 #include "cuda/elements/tet_per_lane.h"
 #include "cuda/rigid/rounds.h"
@@ -22,7 +23,7 @@ struct StreamMemory {
   Quad<T>*x, *velocity, *target, *u, *before;  // [batch, vertices]
   Quad<T>* origin;                             // [batch, slots]
   Quad<T>* shared_force;  // [batch, places]; halo messages in float32 (cuda/common/reductions.h)
-  T* weights;             // [batch or 1, blocks, 2, 32] w V
+  T* weights;             // [batch or 1, blocks, pair_weights, 32]
   T* patch_weight;        // [batch or 1, patches]; -1 unless the patch has one positive stiffness
   double* sums;           // [batch, patches + blocks of shared vertices, sums_count]
   Progress* progress;     // [batch]
@@ -49,6 +50,11 @@ struct StreamCall {
   PD_HD int sum_rows() const { return step.plan.patches + shared_blocks(); }
 };
 
+template <class T>
+PD_HD bool own_weights(const DeviceStep<T>& step) {
+  return has_own_weights(step.material.stiffness, step.poisson);
+}
+
 // Pointers of one environment of a call.
 template <class T, bool HasContacts>
 struct StreamWork {
@@ -73,9 +79,8 @@ struct StreamWork {
         origin(c.memory.origin + e * plan.slots),
         shared_force(c.memory.shared_force + e * c.places()),
         weights(c.memory.weights +
-                (c.step.material.stiffness.stride ? e * plan.blocks * 2 * pair_lanes : 0)),
-        patch_weight(c.memory.patch_weight +
-                     (c.step.material.stiffness.stride ? e * plan.patches : 0)),
+                (own_weights(c.step) ? e * plan.blocks * pair_weights * pair_lanes : 0)),
+        patch_weight(c.memory.patch_weight + (own_weights(c.step) ? e * plan.patches : 0)),
         progress(c.memory.progress[e]),
         contacts{c.memory.planes + e * c.step.material.planes_count,
                  c.memory.spheres + e * c.step.material.spheres_count, c.step.material.planes_count,
@@ -353,12 +358,13 @@ __global__ void __launch_bounds__(decide_threads)
 
 template <class T>
 __global__ void __launch_bounds__(vertex_threads)
-    stream_weights(const __grid_constant__ StreamCall<T> call, bool bounded) {
+    stream_weights(const __grid_constant__ StreamCall<T> call, WeightKind kind) {
   const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
   const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
-  const T* stiffness = call.step.material.stiffness.of(w.environment);
-  compute_patch_weights(patch, rest_of<true>(patch), stiffness, bounded, w.weights);
-  const T one = one_stiffness(patch, stiffness);
+  const Moduli<T> moduli(call.step.material.stiffness, call.step.poisson, w.environment);
+  compute_patch_weights(patch, rest_of<true>(patch), moduli, kind, w.weights);
+  if constexpr (has_poisson_ratio) return;  // the pipeline, which reads the rest, is without it
+  const T one = one_stiffness(patch, moduli.youngs);
   if (threadIdx.x == 0)
     w.patch_weight[patch.index] =
         one > T(0) ? patch_weight(w.plan.patch_unit[patch.index], one) : T(-1);

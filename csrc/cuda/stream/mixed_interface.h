@@ -5,7 +5,7 @@
 
 #include <cuda_runtime.h>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T>
 struct MixedStreamCall : StreamCall<T> {
@@ -23,7 +23,7 @@ void run_mixed_pass(Visit what, const MixedStreamCall<T>& call, std::int64_t pat
 
 // w V of the tetrahedra of `patches` patches.
 template <class T>
-void run_mixed_weights(const StreamCall<T>& call, std::int64_t patches, bool bounded,
+void run_mixed_weights(const StreamCall<T>& call, std::int64_t patches, WeightKind kind,
                        cudaStream_t stream);
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -3,7 +3,7 @@
 #include "cuda/common/runtime.h"
 #include "cuda/stream/mixed_interface.h"
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <Visit What, class T, bool HasContacts>
 __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
@@ -15,11 +15,11 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
 
 template <class T>
 __global__ void __launch_bounds__(vertex_threads)
-    mixed_weights(const __grid_constant__ StreamCall<T> call, bool bounded) {
+    mixed_weights(const __grid_constant__ StreamCall<T> call, WeightKind kind) {
   const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
   const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
-  compute_patch_weights(patch, rest_of<true>(patch), call.step.material.stiffness.of(w.environment),
-                        bounded, w.weights);
+  const Moduli<T> moduli(call.step.material.stiffness, call.step.poisson, w.environment);
+  compute_patch_weights(patch, rest_of<true>(patch), moduli, kind, w.weights);
 }
 
 template <class T, bool HasContacts>
@@ -50,10 +50,10 @@ void run_mixed_pass(Visit what, const MixedStreamCall<T>& call, std::int64_t pat
 }
 
 template <class T>
-void run_mixed_weights(const StreamCall<T>& call, std::int64_t patches, bool bounded,
+void run_mixed_weights(const StreamCall<T>& call, std::int64_t patches, WeightKind kind,
                        cudaStream_t stream) {
-  mixed_weights<T><<<blocks_of(patches), vertex_threads, 0, stream>>>(call, bounded);
+  mixed_weights<T><<<blocks_of(patches), vertex_threads, 0, stream>>>(call, kind);
   check(cudaGetLastError());
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -4,7 +4,7 @@
 
 #include <cuda_runtime.h>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 // Device memory in bytes beside that of a step, aligned to 256.
 template <class T>
@@ -19,4 +19,4 @@ void run_material_comparison(const StreamCall<T>& call, void* memory, cudaStream
 template <class T>
 void run_multilevel(const StreamCall<T>& call, void* memory, cudaStream_t stream);
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

@@ -23,7 +23,7 @@
 #include <limits>
 #include <utility>
 
-namespace pd {
+namespace pd::inline PD_TARGET {
 
 template <class T>
 StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
@@ -36,8 +36,8 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   arena.place(m.origin, step.batch * plan.slots);
   arena.place(m.shared_force, step.batch * call.places());
   arena.place(m.weights,
-              (material.stiffness.stride ? step.batch : 1) * plan.blocks * 2 * pair_lanes);
-  arena.place(m.patch_weight, (material.stiffness.stride ? step.batch : 1) * plan.patches);
+              (own_weights(step) ? step.batch : 1) * plan.blocks * pair_weights * pair_lanes);
+  arena.place(m.patch_weight, (own_weights(step) ? step.batch : 1) * plan.patches);
   arena.place(m.sums, step.batch * call.sum_rows() * sums_count);
   arena.place(m.progress, step.batch);
   arena.place(m.omega, step.batch * guard_period);
@@ -162,19 +162,20 @@ class StreamRunner {
 
  private:
   void assemble_diagonal() {
-    const bool own = call_.step.material.stiffness.stride != 0;
+    const bool own = own_weights(call_.step);
     const std::int64_t sets = own ? patches_ : plan_.patches;
-    weights(sets, set_.weighted);
+    weights(sets, set_.weighted ? WeightKind::majoriser : WeightKind::matrix);
     // the pass starts from u = 0 at the current positions
     launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
     pass<Visit::diagonal>(0);
     decide<Decision::diagonal>(0);
-    if (set_.weighted) weights(sets, false);
+    if (set_.weighted || has_poisson_ratio) weights(sets, WeightKind::force);
   }
 
-  void weights(std::int64_t sets, bool bounded) {
-    if (stencils_) return run_mixed_weights(call_, sets, bounded, stream_);
-    launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, bounded);
+  void weights(std::int64_t sets, WeightKind kind) {
+    if constexpr (!has_poisson_ratio)
+      if (stencils_) return run_mixed_weights(call_, sets, kind, stream_);
+    launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, kind);
   }
 
   void store(int record) {
@@ -189,16 +190,24 @@ class StreamRunner {
     // waits for the whole pass, since converged environments send nothing.
     const unsigned round = set_.tolerance > 0 ? 0 : ++round_;
     const bool piped = !stencils_ && pipe<What>(k, round);
-    if (stencils_) {
-      const MixedStreamCall<T> call{call_, *stencils_};
-      run_mixed_pass<T, HasContacts>(What, call, patches_, pass_shared_, k, stream_);
-    } else if (!piped) {
+    if (!piped && !run_mixed<What>(k))
       launcher_.run(stream_patches<What, T, HasContacts>, patches_, pass_threads, pass_shared_,
                     call_, k);
-    }
     launcher_.run_overlapped(stream_shared<What, T, HasContacts>,
                              call_.step.batch * call_.shared_blocks(), shared_threads, 0, call_, k,
                              piped ? round : 0u);
+  }
+
+  // Runs a pass of a scene with stencils; those with Poisson's ratio have none.
+  template <Visit What>
+  bool run_mixed(int k) {
+    if constexpr (!has_poisson_ratio) {
+      if (stencils_)
+        run_mixed_pass<T, HasContacts>(What, MixedStreamCall<T>{call_, *stencils_}, patches_,
+                                       pass_shared_, k, stream_);
+      return stencils_ != nullptr;
+    }
+    return false;
   }
 
   // Runs an iteration's patches as a pipeline if shared memory holds two of them. The number of
@@ -207,7 +216,7 @@ class StreamRunner {
   template <Visit What>
   bool pipe(int k, unsigned round) {
     constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
-    if constexpr (updates && !HasContacts && sizeof(T) == 4) {
+    if constexpr (updates && !HasContacts && sizeof(T) == 4 && !has_poisson_ratio) {
       const auto kernel = stream_pipeline<What, T>;
       // the pipeline uses 32-bit indices; slots are the largest array of an environment
       constexpr std::int64_t most = std::numeric_limits<std::uint32_t>::max();
@@ -289,7 +298,12 @@ void run_stream_with(const StreamCall<T>& call, void* multilevel_memory,
                      const StencilWork<T>* stencils, cudaStream_t stream) {
   const std::size_t bytes =
       pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2);
-  stencils ? allow_mixed_passes<T, HasContacts>(bytes) : allow_shared_memory<T, HasContacts>(bytes);
+  if constexpr (has_poisson_ratio) {
+    allow_shared_memory<T, HasContacts>(bytes);
+  } else {
+    stencils ? allow_mixed_passes<T, HasContacts>(bytes)
+             : allow_shared_memory<T, HasContacts>(bytes);
+  }
   StreamRunner<T, HasContacts>(call, multilevel_memory, stencils, stream).rollout();
 }
 
@@ -337,4 +351,4 @@ void run_mixed_stream(const MixedStep<T>& step, void* memory, Stream to) {
   run_stream_with<T>(call, nullptr, &stencils, stream);
 }
 
-}  // namespace pd
+}  // namespace pd::inline PD_TARGET

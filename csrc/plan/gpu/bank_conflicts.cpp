@@ -106,6 +106,37 @@ void reduce_bank_conflicts(std::vector<Pair>& pairs) {
   pairs = std::move(ordered);
 }
 
+void reduce_bank_conflicts(std::vector<Pair>& pairs, std::int64_t coupled) {
+  std::vector<Pair> ordered, others(pairs.begin() + coupled, pairs.end());
+  std::vector<std::size_t> waiting;  // first pair of each couple
+  for (std::int64_t i = 0; i < coupled; i += 2) waiting.push_back(std::size_t(i));
+  Phase phase;
+  const auto place = [&](std::size_t number, const PairOrder& order) {
+    if (ordered.size() % phase_lanes == 0) phase = {};
+    ordered.push_back(reordered(pairs[number], order));
+    phase.add(ordered.back());
+  };
+  while (!waiting.empty()) {
+    if (ordered.size() % phase_lanes == 0) phase = {};
+    PairOrder best;
+    std::size_t chosen = 0;
+    for (std::size_t i = 0; i < waiting.size() && best.cost > 0; ++i) {
+      const PairOrder order = best_order(phase, candidate_of(pairs, waiting[i]), best.cost);
+      if (order.cost == best.cost) continue;
+      best = order;
+      chosen = i;
+    }
+    const std::size_t first = waiting[chosen];
+    waiting[chosen] = waiting.back();
+    waiting.pop_back();
+    place(first, best);
+    place(first + 1, best_order(phase, candidate_of(pairs, first + 1), never));
+  }
+  reduce_bank_conflicts(others);
+  ordered.insert(ordered.end(), others.begin(), others.end());
+  pairs = std::move(ordered);
+}
+
 std::int64_t SliceBanks::next(std::int64_t entry) {
   if (count_ == 0) taken_ = {};
   const auto quarter = [&] { return int(entry / entry_slice % 4); };

@@ -15,6 +15,9 @@ namespace pd {
 // are slots. This changes the order of pairs, of the corners of their common face, and of their two tetrahedra.
 void reduce_bank_conflicts(std::vector<Pair>& pairs);
 
+// The same where the first `coupled` pairs stay two by two, in front.
+void reduce_bank_conflicts(std::vector<Pair>& pairs, std::int64_t coupled);
+
 // Slots per slice; the entries of a slot lie so many places apart.
 constexpr int entry_slice = 8;
 

@@ -24,8 +24,8 @@ namespace {
 constexpr int small_part = 64;  // vertices
 
 // Computes the offsets of each patch's arrays.
-void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches, bool stored,
-                    bool fixed) {
+void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches, int members,
+                    bool stored, bool fixed) {
   plan.patch_block = plan.patch_slot = {0};
   for (const MeshPatch& patch : patches) {
     plan.patch_pairs.push_back(std::int32_t(patch.pairs.size()));
@@ -41,6 +41,7 @@ void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches,
         std::to_string(most_blocks) + "; take fewer patches, or a coarser mesh");
   plan.pair_tet.resize(blocks * 2 * lanes);
   plan.pair_bound.resize(blocks * 2 * lanes);
+  if (members == 4) plan.pair_coupled.resize(blocks * lanes);
   if (stored) plan.pair_rest.resize(blocks * pair_rest_numbers * lanes);
   if (!stored && !fixed) plan.slot_rest.resize(slots * 4);
   plan.pair_corner.resize(blocks * 5 * lanes);
@@ -93,6 +94,7 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch,
       forces = 0;
     }
     fill_rest(plan, mesh, patch, pair, unit, block, lane);
+    if (!plan.pair_coupled.empty()) plan.pair_coupled[block * lanes + lane] = i < patch.coupled;
     for (int which = 0; which < 2; ++which) {
       const std::int32_t tet = pair.tet[which];
       const bool copy = tet >= 0 && !mesh.owner.empty() && mesh.counted_by(tet) != number;
@@ -241,6 +243,22 @@ void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pie
     plan.piece_part[next[part_piece[part]]++] = std::int32_t(part);
 }
 
+// Replaces groups by their tetrahedra.
+void expand_groups(Mesh& mesh, const MeshElements& elements) {
+  const Partition groups = std::move(mesh.partition);
+  mesh.partition = {{}, {0}};
+  mesh.group.resize(elements.tet_count);
+  for (int p = 0; p < groups.patches(); ++p) {
+    for (const std::int32_t g : groups.patch(p)) {
+      for (int m = 0; m < elements.members(g); ++m) {
+        mesh.partition.elements.push_back(elements.member(g, m));
+        mesh.group[elements.member(g, m)] = g;
+      }
+    }
+    mesh.partition.start.push_back(std::ssize(mesh.partition.elements));
+  }
+}
+
 std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan,
                                       const std::vector<MeshPatch>& patches, std::int64_t tets,
                                       std::int32_t pieces, int kernel) {
@@ -283,13 +301,14 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
   } else {
     mesh.partition = partition_mesh(elements, patches, 1);
     mesh.numbering = number_vertices(mesh.partition, elements);
+    if (elements.averaged.members > 1) expand_groups(mesh, elements);
   }
   progress(0.4);
   const std::vector<MeshPatch> made = make_patches(mesh, vertices);
   progress(0.7);
 
   DeviceMeshPlan plan;
-  number_patches(plan, made, kernel != stream_kernel, fixed);
+  number_patches(plan, made, elements.averaged.members, kernel != stream_kernel, fixed);
   number_stencils(plan, elements, made);
   renumber(mesh.numbering, made);
   plan.vertex_order = mesh.numbering.vertex_order;
@@ -317,6 +336,7 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
   const bool few = kernel == block_kernel || kernel == cluster_kernel;
   if (pieces > 0) add_parts(plan, piece, pieces, few ? small_part : int(vertices));
   plan.sizes = count_sizes(plan, made, elements.tet_count, pieces, kernel);
+  plan.sizes[size_members] = elements.averaged.members;
   progress(1.0);
   return plan;
 }

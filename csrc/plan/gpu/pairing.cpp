@@ -2,6 +2,10 @@
 
 #include <algorithm>
 #include <bit>
+#include <cstddef>
+#include <iterator>
+#include <stdexcept>
+#include <string>
 
 namespace pd {
 
@@ -78,7 +82,73 @@ std::vector<std::int32_t> match(const std::vector<Corners>& neighbour) {
   return partner;
 }
 
+// The corner of a tetrahedron that the other lacks, if they share the other three; else -1.
+int corner_off(const Corners& one, const Corners& other) {
+  int found = -1, missing = 0;
+  for (int k = 0; k < 4; ++k) {
+    if (place_of(other, one[k]) < 4) continue;
+    found = k;
+    ++missing;
+  }
+  return missing == 1 ? found : -1;
+}
+
+Pair single_pair(const std::vector<Corners>& tets, std::int32_t t) {
+  const Corners& v = tets[t];
+  return {{t, -1}, {v[0], v[1], v[2], v[3], v[3]}};
+}
+
+// Two tetrahedra that share the face opposite corner k of the first.
+Pair pair_across(const std::vector<Corners>& tets, std::int32_t t, int k, std::int32_t partner) {
+  const Corners& v = tets[t];
+  const std::int32_t apex = tets[partner][corner_off(tets[partner], v)];
+  return {{t, partner}, {v[(k + 1) % 4], v[(k + 2) % 4], v[(k + 3) % 4], v[k], apex}};
+}
+
+// Pairs of the tetrahedra from `first` on: all of them if `whole`, else all but one.
+bool pair_up(const std::vector<Corners>& tets, const std::vector<std::int32_t>& members,
+             std::vector<Pair>& pairs) {
+  if (members.empty()) return true;
+  const std::int32_t t = members[0];
+  for (std::size_t i = 1; i < members.size(); ++i) {
+    const int k = corner_off(tets[t], tets[members[i]]);
+    if (k < 0) continue;
+    std::vector<std::int32_t> rest(members.begin() + 1, members.end());
+    rest.erase(rest.begin() + std::ptrdiff_t(i) - 1);
+    pairs.push_back(pair_across(tets, t, k, members[i]));
+    if (pair_up(tets, rest, pairs)) return true;
+    pairs.pop_back();
+  }
+  if (members.size() % 2 == 0) return false;
+  pairs.push_back(single_pair(tets, t));
+  if (pair_up(tets, {members.begin() + 1, members.end()}, pairs)) return true;
+  pairs.pop_back();
+  return false;
+}
+
 }  // namespace
+
+std::vector<Pair> pair_groups(const std::vector<Corners>& tets, const std::vector<int>& sizes,
+                              std::int64_t& coupled) {
+  std::vector<Pair> couples, others, own;
+  std::int32_t first = 0;
+  for (const int size : sizes) {
+    std::vector<std::int32_t> members(size);
+    for (int m = 0; m < size; ++m) members[m] = first + m;
+    first += size;
+    own.clear();
+    if (!pair_up(tets, members, own))
+      throw std::invalid_argument(
+          "a GPU averages the trace over groups of tetrahedra that form one or two pairs with a "
+          "common face each, and a group of " +
+          std::to_string(size) + " does not; give Solid(averaging=) other groups, or 1, 2 or 4");
+    std::vector<Pair>& to = own.size() == 2 ? couples : others;
+    to.insert(to.end(), own.begin(), own.end());
+  }
+  coupled = std::ssize(couples);
+  couples.insert(couples.end(), others.begin(), others.end());
+  return couples;
+}
 
 std::vector<Pair> pair_tets(const std::vector<Corners>& tets) {
   const std::vector<Corners> neighbour = face_neighbours(tets);

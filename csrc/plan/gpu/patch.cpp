@@ -69,6 +69,7 @@ void count_entries(MeshPatch& patch) {
 // the first blocks.
 void order_pairs(MeshPatch& patch, int number, const Numbering& numbering) {
   patch.outer = std::ssize(patch.pairs);
+  if (patch.coupled > 0) return reduce_bank_conflicts(patch.pairs, patch.coupled);
   if (patch.outer <= small_pairs) return reduce_bank_conflicts(patch.pairs);
   const auto is_outer = [&](const Pair& pair) {
     return std::any_of(pair.corner.begin(), pair.corner.end(), [&](std::int32_t s) {
@@ -123,7 +124,16 @@ MeshPatch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& num
   add_stencils(patch, mesh.elements, elements.subspan(tets.size()), local);
   for (const std::int32_t v : patch.vertex) number[v] = -1;
 
-  patch.pairs = pair_tets(corners);
+  if (mesh.group.empty()) {
+    patch.pairs = pair_tets(corners);
+  } else {
+    std::vector<int> sizes;
+    for (std::size_t t = 0; t < tets.size(); ++t) {
+      const bool begins = t == 0 || mesh.group[tets[t]] != mesh.group[tets[t - 1]];
+      begins ? sizes.push_back(1) : void(++sizes.back());
+    }
+    patch.pairs = pair_groups(corners, sizes, patch.coupled);
+  }
   patch.forces.assign(patch.vertex.size(), 0);
   for (const Pair& pair : patch.pairs) {
     for (int c = 0; c < pair.corners(); ++c) ++patch.forces[pair.corner[c]];

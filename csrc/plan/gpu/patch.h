@@ -23,6 +23,8 @@ struct Mesh {
   Numbering numbering;
   std::vector<std::int32_t> owner;  // cluster: the patch that owns each vertex
   int kernel;
+  std::vector<std::int32_t> group =
+      {};  // number of each tetrahedron's group, in runs of the partition; none: pairs are free
 
   // The patch that counts the energy of a tetrahedron, if several compute it.
   std::int32_t counted_by(std::int32_t tet) const {
@@ -47,7 +49,8 @@ struct MeshPatch {
   std::vector<std::int32_t> forces;  // entries that each slot sums
   std::vector<Pair> pairs;           // user's tetrahedra; corners are slots
   std::vector<PatchStencils> stencils;
-  std::int64_t outer = 0;  // number of leading pairs that may touch shared vertices
+  std::int64_t outer = 0;    // number of leading pairs that may touch shared vertices
+  std::int64_t coupled = 0;  // number of leading pairs that average with their neighbour
   std::int64_t entries = 0;
   bool piped = false;  // whether cuda/stream/pipeline.h reads and writes the entries
 

@@ -1,0 +1,9 @@
+// The kernels of "stream" for scenes with Poisson's ratio, see cuda/elements/group_lanes.h.
+#define PD_TARGET poisson
+#define PD_POISSON
+#include "cuda/stream/runner.cuh"
+
+namespace pd {
+template std::int64_t stream_bytes(const DeviceStep<double>&);
+template void run_stream(const DeviceStep<double>&, void*, Stream);
+}  // namespace pd
