@@ -2,6 +2,7 @@
 #include "binding/settings.h"
 #include "cpu/dispatch.h"
 #include "cuda/common/launch.h"
+#include "cuda/poisson/launch.h"
 #include "elements/kinds.h"
 #include "plan/cpu/build.h"
 #include "plan/gpu/build.h"
@@ -252,7 +253,7 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets,
                            const std::optional<Indices>& tet_group) {
   pd::MeshElements elements = mesh_elements(positions, tets, stencils);
   elements.averaged = tet_groups(tet_group, tets);
-  if (patches < 1 || patches > tets.shape(0) + elements.count() - elements.solids()) {
+  if (patches < 1 || patches > elements.count()) {
     throw py::value_error("patches must lie in 1.." + std::to_string(elements.count()) +
                           ", the number of elements, got " + std::to_string(patches));
   }
@@ -411,7 +412,9 @@ py::dict build_info() {
 template <class T>
 std::int64_t bytes_of([[maybe_unused]] const pd::MixedStep<T>& step) {
 #if defined(TORCHPD_CUDA)
-  return step.stencils.blocks > 0 ? pd::mixed_step_bytes(step) : pd::step_bytes(step);
+  if (step.stencils.blocks > 0) return pd::mixed_step_bytes(step);
+  const bool poisson = step.plan.members > 0;
+  return poisson ? pd::poisson::step_bytes(step) : pd::step_bytes<T>(step);
 #else
   throw std::runtime_error("this build of torchpd has no CUDA kernels");
 #endif

@@ -3,7 +3,7 @@
 // A Backend has `Plan<T>`, the plan that its kernels read, and `plan_view<T>(arrays, place)`. `Step<T>`, `Field<T>` and
 // `Conjugate<T>` are its calls with effects; `view_stencils(call, arrays, place)` adds the stencils of the plan to one,
 // and `stencil_counts(call)` is their number of each kind, null without any. `sums_tets`: whether Field::effect_energy
-// counts tetrahedra. Its functions `step`, `report`, `field`,
+// counts tetrahedra; `has_stencils(plan)`: whether there is more to count. Its functions `step`, `report`, `field`,
 // `precondition`, `conjugate` and `rotation` run a call on the device of the tensor they are given.
 #pragma once
 #include "binding/checks.h"

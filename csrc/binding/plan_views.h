@@ -300,6 +300,10 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
                     "plan must be one for kernel 3 (stream) where it has a multilevel "
                     "preconditioner, which no other knows, got kernel ",
                     plan.kernel);
+  TORCH_CHECK_VALUE((plan.members >= 0 && plan.members <= 2) || plan.members == 4,
+                    "plan.sizes must have groups of 1, 2 or 4 tetrahedra, 0 without Poisson's "
+                    "ratio, got ",
+                    plan.members, "; compile the scene again");
   TORCH_CHECK_VALUE(plan.environments >= 0 && plan.environments <= most_environments,
                     "plan.sizes must have a multiprocessor work on 0 to ", most_environments,
                     " environments, got ", plan.environments, "; compile the scene again");

@@ -8,7 +8,7 @@ import pytest
 import torch
 from devices import require_gpu
 from mixed_scenes import CASES, mixed_case, sheet_case
-from on_gpu import DTYPES, GPU, host_waits, moved, on_gpu, relative
+from on_gpu import DTYPES, GPU, gradients_after_two_steps, host_waits, moved, on_gpu, relative, rounds_as
 from runs import noise, same_bits, simulator, state_of
 from torch import Tensor
 
@@ -22,7 +22,6 @@ require_gpu()
 
 KERNELS = ("block", "stream")
 EFFECTS = {row.name for row in EFFECT_ROWS}
-ROUNDED = 1e-12  # of float64, relative to the largest number
 pytestmark = [
     pytest.mark.usefixtures("poisoned"),
     # they start a little inside a ground and a ball, so that contacts act
@@ -60,13 +59,6 @@ def own_rows(sim: pd.Simulator, batch: int) -> dict[str, Tensor]:
     return {name: (shades * getattr(sim, name).detach().double().cpu()).to(sim.dtype) for name in names}
 
 
-def check(found: Tensor, cpu: Tensor, wide: Tensor, precision: str) -> None:
-    """As near to float64 as the CPU is: its rounding differs by the order of sums alone."""
-    assert torch.isfinite(found).all()
-    least = ROUNDED if precision == "float64" else 4.0 * relative(cpu, wide) + 2.0**-21
-    assert relative(found, wide) <= least
-
-
 @pytest.mark.parametrize("iterations", [1, 2, 9, 40])
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", CASES)
@@ -77,8 +69,8 @@ def test_steps_are_those_of_the_cpu(name: str, kernel: str, iterations: int, pre
         (one, info), (two, _), (wide, said) = (
             sim(moved(state, sim.device, sim.dtype), forces.to(sim.device, sim.dtype), return_info=True) for sim in sims
         )
-        check(one.velocities, two.velocities, wide.velocities, precision)
-        check(one.positions, two.positions, wide.positions, precision)
+        assert rounds_as(one.velocities, two.velocities, wide.velocities)
+        assert rounds_as(one.positions, two.positions, wide.positions)
         near = 1e-10 if precision == "float64" else 1e-3
         assert relative(info.energy, said.energy) <= near
         assert torch.equal(info.iterations.cpu(), said.iterations)
@@ -93,7 +85,7 @@ def test_environments_have_rows_of_their_own(name: str, kernel: str, precision: 
     for sim in sims:
         sim.set_material(**{key: row.to(sim.device, sim.dtype) for key, row in rows.items()})
     one, two, wide = (sim(moved(state, sim.device, sim.dtype), forces.to(sim.device, sim.dtype)) for sim in sims)
-    check(one.velocities, two.velocities, wide.velocities, precision)
+    assert rounds_as(one.velocities, two.velocities, wide.velocities)
     assert not same_bits(
         one, on_gpu(CASES[name](), sims[0].dtype, kernel, iterations=12)(moved(state, GPU), forces.to(GPU))
     )
@@ -197,38 +189,7 @@ def test_fields_are_those_of_the_cpu(name: str, kernel: str, own: bool, precisio
             if expected.numel():
                 one, two = (of[field][number] for of in found[:2])
                 assert one.shape == expected.shape, field
-                check(one, two, expected, precision)
-
-
-def gradients(
-    sim: pd.Simulator, state: pd.State, forces: Tensor, rows: dict[str, Tensor], weight: Tensor
-) -> dict[str, Tensor]:
-    """Of a loss after two steps, for the state, the forces and every array of the material."""
-    given = {name: getattr(sim, name).detach() for name in sim.material_names} | {
-        name: row.to(sim.device, sim.dtype) for name, row in rows.items()
-    }
-    given = {name: row.clone().requires_grad_() for name, row in given.items() if row.numel()}
-    starts = [t.to(sim.device, sim.dtype).clone().requires_grad_() for t in (*state, forces)]
-
-    def run() -> Tensor:
-        after = sim(sim(pd.State(starts[0], starts[1]), starts[2]), starts[2])
-        scale = weight.to(after.positions)
-        return (scale * after.positions).sum() + 0.01 * (scale * after.velocities).sum()
-
-    with torch.enable_grad():
-        loss = torch.func.functional_call(_Loss(sim, run), {f"sim.{name}": row for name, row in given.items()}, ())
-    names = ["positions", "velocities", "forces", *given]
-    return dict(zip(names, torch.autograd.grad(loss, [*starts, *given.values()]), strict=True))
-
-
-class _Loss(torch.nn.Module):
-    def __init__(self, sim: pd.Simulator, run: Any) -> None:
-        super().__init__()
-        self.sim, self.run = sim, run
-
-    def forward(self) -> Tensor:
-        found: Tensor = self.run()
-        return found
+                assert rounds_as(one, two, expected)
 
 
 @pytest.mark.parametrize("own", [False, True], ids=["shared", "own rows"])
@@ -240,7 +201,7 @@ def test_gradients_of_every_row_are_those_of_the_cpu(name: str, kernel: str, own
     state, forces = different(sims[1], name, 3)
     rows = own_rows(sims[1], 3) if own else {}
     weight = noise(state.positions, 5)
-    one, two, wide = (gradients(sim, state, forces, rows, weight) for sim in sims)
+    one, two, wide = (gradients_after_two_steps(sim, state, forces, rows, weight) for sim in sims)
     assert one.keys() == wide.keys()
     for key, expected in wide.items():
         if not expected.abs().max() > 0.0:
@@ -256,11 +217,13 @@ def test_gradients_do_not_feel_their_batch(kernel: str, precision: str) -> None:
     sim = on_gpu(sheet_case(), DTYPES[precision], kernel, iterations=200)
     state, forces = different(sim, "sheet", 40)
     rows, weight = own_rows(sim, 40), noise(state.positions, 5)
-    together = gradients(sim, state, forces, rows, weight)
+    together = gradients_after_two_steps(sim, state, forces, rows, weight)
 
     def some(items: slice) -> dict[str, Tensor]:
         start = pd.State(*(t[items] for t in state))
-        return gradients(sim, start, forces[items], {k: r[items] for k, r in rows.items()}, weight[items])
+        return gradients_after_two_steps(
+            sim, start, forces[items], {k: r[items] for k, r in rows.items()}, weight[items]
+        )
 
     for items in (slice(0, 1), slice(17, 20), slice(0, 40)):
         alone = some(items)

@@ -104,6 +104,43 @@ def relative(found: torch.Tensor, expected: torch.Tensor) -> float:
     return float(difference) / max(float(want.abs().max()), 1e-300)
 
 
+def rounds_as(found: torch.Tensor, cpu: torch.Tensor, wide: torch.Tensor) -> bool:
+    """Whether it is as near to float64 as the CPU is: its rounding differs by the order of sums alone."""
+    least = 1e-12 if found.dtype == torch.float64 else 4.0 * relative(cpu, wide) + 2.0**-21
+    return bool(torch.isfinite(found).all()) and relative(found, wide) <= least
+
+
+class _Loss(torch.nn.Module):
+    def __init__(self, sim: pd.Simulator, run: Callable[[], torch.Tensor]) -> None:
+        super().__init__()
+        self.sim, self.run = sim, run
+
+    def forward(self) -> torch.Tensor:
+        return self.run()
+
+
+def gradients_after_two_steps(
+    sim: pd.Simulator, state: pd.State, forces: torch.Tensor, rows: dict[str, torch.Tensor], weight: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Of a loss, for the state, the forces and every array of the material; `rows` replace some of these."""
+    given = {name: getattr(sim, name).detach() for name in sim.material_names} | {
+        name: row.to(sim.device, sim.dtype) for name, row in rows.items()
+    }
+    given = {name: row.clone().requires_grad_() for name, row in given.items() if row.numel()}
+    starts = [t.to(sim.device, sim.dtype).clone().requires_grad_() for t in (*state, forces)]
+
+    def run() -> torch.Tensor:
+        after = sim(sim(pd.State(starts[0], starts[1]), starts[2]), starts[2])
+        scale = weight.to(after.positions)
+        loss: torch.Tensor = (scale * after.positions).sum() + 0.01 * (scale * after.velocities).sum()
+        return loss
+
+    with torch.enable_grad():
+        loss = torch.func.functional_call(_Loss(sim, run), {f"sim.{name}": row for name, row in given.items()}, ())
+    names = ["positions", "velocities", "forces", *given]
+    return dict(zip(names, torch.autograd.grad(loss, [*starts, *given.values()]), strict=True))
+
+
 def host_waits(call: Callable[[], object]) -> bool:
     """Whether the host waits for the device in a call: an error where torch knows that it would.
 

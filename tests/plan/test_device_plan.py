@@ -274,6 +274,7 @@ def test_sizes_count_the_arrays(kernel: int, case: tuple[str, int], values: Scen
         "most_pairs": plan.patch_pairs.max(),
         "most_entries": entries_of(plan).max(),
         "most_interior": np.diff(plan.patch_vertex).max(),
+        "members": 0,
         "environments": 0,
     }
     assert dict(zip(SIZES, plan.sizes.tolist(), strict=True)) == expected

@@ -10,9 +10,11 @@ import torch
 from cases import box
 
 import torchpd as pd
+from torchpd.common.gpu import H100
 from torchpd.common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
 from torchpd.plan.cpu_plan import compile_plan
 from torchpd.plan.gpu_plan import compile_device_plan
+from torchpd.plan.kernel_choice import choose_plan
 from torchpd.scene import Scene
 from torchpd.scene.effects import Solid
 from torchpd.scene.scene import SceneValues
@@ -64,6 +66,16 @@ def test_a_group_is_a_pair_or_two_neighbouring_ones(size: int, kernel: int, patc
     assert all(len(places) == 1 for places in where.values())
     lanes = [place for places in where.values() for place in places]
     assert len(set(lanes)) == len(lanes)
+
+
+def test_patches_do_not_cut_a_group() -> None:
+    mesh = pd.TetMesh(np.concatenate([np.zeros((1, 3)), np.eye(3), np.ones((1, 3))]), [[0, 1, 2, 3], [1, 2, 3, 4]])
+    values = Scene(Solid(mesh, youngs=1.0, poisson=0.4, averaging=2, density=1.0)).values()
+    with pytest.raises(ValueError, match=r"patches must lie in 1\.\.1, "):
+        compile_device_plan(values, 2, GRID, torch.float32, progress=False)
+    for kernel in ("block", "grid", "stream"):
+        plan = choose_plan(values, torch.float32, H100, kernel, progress=False)
+        assert (plan.size("members"), plan.patches) == (2, 1)
 
 
 def test_groups_that_no_pairs_make_are_refused() -> None:

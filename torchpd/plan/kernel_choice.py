@@ -17,6 +17,9 @@ tetrahedra at patch borders are computed more than once. Patches exchange no for
 of a vertex is written to the shared memory of the patches that hold a copy. The patches of the other kernels share no
 tetrahedra and exchange the forces on shared vertices.
 
+A group of tetrahedra that averages its volume strain lies in one patch. The patches of a cluster would cut it, so
+solids with Poisson's ratio run as "block", "grid" or "stream".
+
 Scenes with stencils (cloth, rods, springs, ties, fibres) run as "block" where the mesh fits the shared memory of a
 block, else as "stream".
 
@@ -31,6 +34,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from .. import _C
@@ -109,9 +113,17 @@ class _PlanBuilder(NamedTuple):
         return len(self.values.tets)
 
     @property
+    def solids(self) -> int:
+        """Tetrahedra, or the groups of them that average their volume strain, which no patch cuts."""
+        group = self.values.tet_group
+        if group is None:
+            return self.tets
+        return len(np.unique(group[group >= 0])) + int((group < 0).sum())
+
+    @property
     def elements(self) -> int:
-        """Tetrahedra and stencils."""
-        return self.tets + sum(len(group) for group in self.values.stencils)
+        """What patches may be cut into: solids and stencils."""
+        return self.solids + sum(len(group) for group in self.values.stencils)
 
     @property
     def stencil_corners(self) -> int:
@@ -173,7 +185,7 @@ class _PlanBuilder(NamedTuple):
 
     def max_grid_patches(self, gpu: Properties) -> int:
         """Most patches of a grid that leave each one its least number of tetrahedra."""
-        return min(gpu.multiprocessors, max(2, self.tets // _MIN_GRID_TETS), self.tets)
+        return min(gpu.multiprocessors, max(2, self.tets // _MIN_GRID_TETS), self.solids)
 
     def ranked_grids(self, batch: int, gpu: Properties) -> list[tuple[float, int]]:
         """Estimated microseconds per iteration for each useful number of patches, in ascending order of time.

@@ -228,12 +228,13 @@ def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.de
         array = compiled.named[name]
         return array.dim() > dims_of(name) and len(array) == batch
 
+    tets = own("stiffness") or ("poisson" in compiled.named and own("poisson"))
     effects = any(own(row.name) for row in EFFECT_ROWS if row.name in compiled.named)
     schedule: int = compiled.solver.settings()["schedule"]
     with torch.cuda.device(device):
         return _C.step_bytes(
             real, plan.sizes.numpy(), levels, stencils, schedule, batch, planes.shape[-2], spheres.shape[-2],
-            own("stiffness"), effects,
+            tets, effects,
         )  # fmt: skip
 
 

@@ -74,7 +74,8 @@ class Solid(Body):
             needs many iterations, and a `SceneWarning` says so. The scalar 0 compiles lambda away.
         averaging: tetrahedra that share the mean of t: 1, 2 or 4 at most, or the number of a group for each
             tetrahedron [E]. None: 2 for the lattice of `tetrahedralize`, which hardly locks, and 4 otherwise. Groups
-            of 2 and 4 share faces and have similar bulk moduli. The law "volume" averages nothing.
+            of 2 and 4 share faces and have similar bulk moduli. On a GPU a group must be one or two pairs with a common
+            face each, as these are, or one tetrahedron more. The law "volume" averages nothing.
         law: "corotated" or "volume". "volume" takes a positive Poisson's ratio.
         strain_limit: least and largest stretch (lo, hi), or one pair per tetrahedron [E, 2], lo <= 1 <= hi; None: no
             limit. Beyond them V k / 2 dist^2(F, {stretches in [lo, hi], det F > 0}) adds to the energy.

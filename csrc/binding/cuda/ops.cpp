@@ -3,30 +3,11 @@
 
 #include "binding/plan_views.h"
 #include "cuda/common/launch.h"
+#include "cuda/poisson/launch.h"
 
 #include <c10/cuda/CUDAGraphsC10Utils.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
-
-// The kernels for scenes with Poisson's ratio, which csrc/cuda/poisson compiles.
-namespace pd::poisson {
-template <class T>
-std::int64_t fused_bytes(const DeviceStep<T>& call);
-template <class T>
-void run_fused(const DeviceStep<T>& call, void* memory, Stream stream);
-template <class T>
-std::int64_t stream_bytes(const DeviceStep<T>& call);
-template <class T>
-void run_stream(const DeviceStep<T>& call, void* memory, Stream stream);
-template <class T>
-std::int64_t field_bytes(const DeviceField<T>& call);
-template <class T>
-void run_field(const DeviceField<T>& call, void* memory, Stream stream);
-template <class T>
-std::int64_t conjugate_bytes(const DeviceConjugate<T>& call);
-template <class T>
-void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream stream);
-}  // namespace pd::poisson
 
 namespace pd {
 namespace {
@@ -66,6 +47,13 @@ struct Cuda {
     return own;
   }
   template <class Call>
+  static bool has_poisson(const Mixed<Call>& call) {
+    TORCH_CHECK_VALUE(!call.effects.poisson.data || call.plan.members > 0,
+                      "plan must have groups of tetrahedra for a material with Poisson's ratio; "
+                      "compile the scene again");
+    return call.effects.poisson.data != nullptr;
+  }
+  template <class Call>
   static bool is_mixed(const Mixed<Call>& call) {
     TORCH_CHECK_NOT_IMPLEMENTED(
         call.stencils.blocks == 0 || !call.effects.poisson.data,
@@ -80,7 +68,7 @@ struct Cuda {
     if (is_mixed(call))
       return run(like, call, mixed_step_bytes<T>,
                  stream ? run_mixed_stream<T> : run_mixed_block<T>);
-    if (call.effects.poisson.data) {
+    if (has_poisson(call)) {
       const DeviceStep<T> own = with_poisson(call);
       stream ? run<DeviceStep<T>>(like, own, poisson::stream_bytes<T>, poisson::run_stream<T>)
              : run<DeviceStep<T>>(like, own, poisson::fused_bytes<T>, poisson::run_fused<T>);
@@ -94,7 +82,7 @@ struct Cuda {
     if (is_mixed(call)) return run(like, call, mixed_field_bytes<T>, run_mixed_field<T>);
     // what belongs to effects is zero
     if (call.field == pd::Field::effect_energy || call.field == pd::Field::effect_products) return;
-    call.effects.poisson.data
+    has_poisson(call)
         ? run(like, with_poisson(call), poisson::field_bytes<T>, poisson::run_field<T>)
         : run<DeviceField<T>>(like, call, field_bytes<T>, run_field<T>);
   }
@@ -113,7 +101,7 @@ struct Cuda {
   template <class T>
   static void conjugate(const Conjugate<T>& call, const Tensor& like) {
     if (is_mixed(call)) return run(like, call, mixed_conjugate_bytes<T>, run_mixed_conjugate<T>);
-    call.effects.poisson.data
+    has_poisson(call)
         ? run(like, with_poisson(call), poisson::conjugate_bytes<T>, poisson::run_conjugate<T>)
         : run<DeviceConjugate<T>>(like, call, conjugate_bytes<T>, run_conjugate<T>);
   }

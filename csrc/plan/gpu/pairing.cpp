@@ -105,7 +105,7 @@ Pair pair_across(const std::vector<Corners>& tets, std::int32_t t, int k, std::i
   return {{t, partner}, {v[(k + 1) % 4], v[(k + 2) % 4], v[(k + 3) % 4], v[k], apex}};
 }
 
-// Pairs of the tetrahedra from `first` on: all of them if `whole`, else all but one.
+// Adds pairs of all members of a group, one of which is single where their number is odd; false if there are none.
 bool pair_up(const std::vector<Corners>& tets, const std::vector<std::int32_t>& members,
              std::vector<Pair>& pairs) {
   if (members.empty()) return true;

@@ -18,9 +18,9 @@ struct Pair {
   int corners() const { return single() ? 4 : 5; }
 };
 
-// Pairs tetrahedra in groups that average their trace: those of one patch, group by group, each of `sizes` members. Pairs
-// of the groups of more than two come first, two by two; `coupled` counts them. Throws std::invalid_argument for a group
-// whose tetrahedra do not form pairs that share a face.
+// Pairs tetrahedra in groups that average their trace: those of one patch, group by group, each of `sizes` members.
+// Pairs of the groups of more than two come first, two by two; `coupled` counts them. Throws std::invalid_argument for
+// a group whose tetrahedra do not form pairs that share a face.
 std::vector<Pair> pair_groups(const std::vector<Corners>& tets, const std::vector<int>& sizes,
                               std::int64_t& coupled);
 

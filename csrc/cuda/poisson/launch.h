@@ -1,0 +1,31 @@
+// Entry points of the kernels for scenes with Poisson's ratio: those of cuda/common/launch.h, compiled a second time,
+// see cuda/elements/group_lanes.h.
+#pragma once
+#include "cuda/common/launch.h"
+
+namespace pd::poisson {
+
+template <class T>
+std::int64_t fused_bytes(const DeviceStep<T>& call);
+template <class T>
+void run_fused(const DeviceStep<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t stream_bytes(const DeviceStep<T>& call);
+template <class T>
+void run_stream(const DeviceStep<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t step_bytes(const DeviceStep<T>& call) {
+  return call.plan.kernel == int(DeviceKernel::stream) ? poisson::stream_bytes(call)
+                                                       : poisson::fused_bytes(call);
+}
+
+template <class T>
+std::int64_t field_bytes(const DeviceField<T>& call);
+template <class T>
+void run_field(const DeviceField<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t conjugate_bytes(const DeviceConjugate<T>& call);
+template <class T>
+void run_conjugate(const DeviceConjugate<T>& call, void* memory, Stream stream);
+
+}  // namespace pd::poisson
