@@ -412,8 +412,9 @@ py::dict build_info() {
 template <class T>
 std::int64_t bytes_of([[maybe_unused]] const pd::MixedStep<T>& step) {
 #if defined(TORCHPD_CUDA)
-  if (step.stencils.blocks > 0) return pd::mixed_step_bytes(step);
   const bool poisson = step.plan.members > 0;
+  if (step.stencils.blocks > 0)
+    return poisson ? pd::poisson::mixed_step_bytes(step) : pd::mixed_step_bytes(step);
   return poisson ? pd::poisson::step_bytes(step) : pd::step_bytes<T>(step);
 #else
   throw std::runtime_error("this build of torchpd has no CUDA kernels");

@@ -94,7 +94,7 @@ def test_environments_have_rows_of_their_own(name: str, kernel: str, precision: 
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
 @pytest.mark.parametrize("own", [False, True], ids=["shared", "own rows"])
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("name", ["sheet", "mixed"])
+@pytest.mark.parametrize("name", ["sheet", "mixed", "mixed, poisson"])
 def test_runs_and_batches_do_not_matter(name: str, kernel: str, own: bool, tolerance: float, precision: str) -> None:
     batch = 700
     case, dtype = CASES[name](), DTYPES[precision]
@@ -159,7 +159,9 @@ def ops_of(sim: pd.Simulator, state: pd.State, along: Tensor) -> dict[str, list[
     """All fields of the elastic energy."""
     ops, material, plan = torch.ops.torchpd, [t.detach() for t in sim.material()], list(sim.plan.arrays)
     x, d = state.positions, along
+    moduli = [ops.lame_product(x, way, material, plan) for way in (d, None) if "poisson" in sim.material_names]
     return {
+        "moduli": moduli,
         "gradient": [ops.gradient(x, material, plan)],
         "hessian": [ops.hessian_product(x, d, material, plan)],
         "diagonal": [ops.elastic_diagonal(material, plan, weighted=False)],
@@ -213,9 +215,10 @@ def test_gradients_of_every_row_are_those_of_the_cpu(name: str, kernel: str, own
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_gradients_do_not_feel_their_batch(kernel: str, precision: str) -> None:
-    sim = on_gpu(sheet_case(), DTYPES[precision], kernel, iterations=200)
-    state, forces = different(sim, "sheet", 40)
+@pytest.mark.parametrize("name", ["sheet", "springs, poisson"])
+def test_gradients_do_not_feel_their_batch(name: str, kernel: str, precision: str) -> None:
+    sim = on_gpu(CASES[name](), DTYPES[precision], kernel, iterations=200)
+    state, forces = different(sim, name, 40)
     rows, weight = own_rows(sim, 40), noise(state.positions, 5)
     together = gradients_after_two_steps(sim, state, forces, rows, weight)
 
@@ -232,8 +235,9 @@ def test_gradients_do_not_feel_their_batch(kernel: str, precision: str) -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_step_takes_what_it_is_said_to(kernel: str, precision: str) -> None:
-    sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=2)
+@pytest.mark.parametrize("name", ["mixed", "mixed, poisson"])
+def test_a_step_takes_what_it_is_said_to(name: str, kernel: str, precision: str) -> None:
+    sim = on_gpu(CASES[name](), DTYPES[precision], kernel, iterations=2)
 
     def taken(batch: int) -> int:
         state = sim.rest_state(batch)

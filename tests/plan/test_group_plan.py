@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from cases import box
+from sheets import cloth
 
 import torchpd as pd
 from torchpd.common.gpu import H100
-from torchpd.common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES
+from torchpd.common.tables import DEVICE_SIZES, KINDS
 from torchpd.plan.cpu_plan import compile_plan
-from torchpd.plan.gpu_plan import compile_device_plan
+from torchpd.plan.gpu_plan import compile_device_plan, device_table
 from torchpd.plan.kernel_choice import choose_plan
 from torchpd.scene import Scene
 from torchpd.scene.effects import Solid
@@ -23,9 +25,9 @@ LANES, PAIRS = 16, 32  # of a block on the CPU and on a GPU
 BLOCK, GRID, STREAM = 0, 2, 3
 
 
-def values_of(size: int, cells: tuple[int, int, int] = (6, 4, 4)) -> SceneValues:
-    mesh = pd.TetMesh(*box((6.0, 4.0, 4.0), cells))
-    values = Scene(Solid(mesh, youngs=1.0, poisson=0.4, averaging=size, density=1.0)).values()
+def values_of(size: int, *others: Any) -> SceneValues:
+    mesh = pd.TetMesh(*box((6.0, 4.0, 4.0), (6, 4, 4)))
+    values = Scene(Solid(mesh, youngs=1.0, poisson=0.4, averaging=size, density=1.0), *others).values()
     assert values.tet_group is not None
     counts = np.bincount(values.tet_group)
     assert counts.max() == size
@@ -50,10 +52,13 @@ def test_a_group_has_one_lane_of_consecutive_blocks(size: int, patch_size: int) 
 
 
 @pytest.mark.parametrize("size", [2, 4])
-@pytest.mark.parametrize(("kernel", "patches"), [(BLOCK, 1), (GRID, 5), (STREAM, 1), (STREAM, 5)])
-def test_a_group_is_a_pair_or_two_neighbouring_ones(size: int, kernel: int, patches: int) -> None:
-    values = values_of(size)
-    names = [row.name for row in DEVICE_PLAN_TABLE]
+@pytest.mark.parametrize(
+    ("kernel", "patches", "others"),
+    [(BLOCK, 1, ()), (GRID, 5, ()), (STREAM, 1, ()), (STREAM, 5, ()), (BLOCK, 1, (cloth(),)), (STREAM, 5, (cloth(),))],
+)
+def test_a_group_is_a_pair_or_two_neighbouring_ones(size: int, kernel: int, patches: int, others: Any) -> None:
+    values = values_of(size, *others)
+    names = [row.name for row in device_table(values)]
     plan = dict(zip(names, compile_device_plan(values, patches, kernel, torch.float32, progress=False), strict=True))
     assert plan["sizes"][DEVICE_SIZES.index("members")] == size
     tets = plan["pair_tet"].numpy().reshape(-1, 2, PAIRS)
@@ -66,6 +71,23 @@ def test_a_group_is_a_pair_or_two_neighbouring_ones(size: int, kernel: int, patc
     assert all(len(places) == 1 for places in where.values())
     lanes = [place for places in where.values() for place in places]
     assert len(set(lanes)) == len(lanes)
+
+
+@pytest.mark.parametrize(("kernel", "patches"), [(BLOCK, 1), (STREAM, 3)])
+def test_tets_beside_a_volume_energy_are_marked(kernel: int, patches: int) -> None:
+    """Stencils have it for one of two solids, whose tetrahedra are alone; the other one's are in groups of four."""
+    mesh = pd.TetMesh(*box((2.0, 2.0, 2.0), (2, 2, 2)))
+    grouped = Solid(mesh, youngs=1.0, poisson=0.4, averaging=4, density=1.0)
+    traceless = Solid(mesh.translated((5.0, 0.0, 0.0)), youngs=1.0, poisson=0.4, law="volume", density=1.0)
+    values = Scene(grouped, traceless).values()
+    names = [row.name for row in device_table(values)]
+    plan = dict(zip(names, compile_device_plan(values, patches, kernel, torch.float64, progress=False), strict=True))
+    tets, bound = plan["pair_tet"].numpy().reshape(-1), plan["pair_bound"].numpy().reshape(-1)
+    there = tets >= 0
+    assert sorted(tets[there]) == list(range(len(values.tets)))
+    assert ((bound[there] < 0.0) == (values.tet_group[tets[there]] < 0)).all()
+    count = int(plan["stencil_sizes"][4 + list(KINDS).index("volume")])
+    assert count == (bound[there] < 0.0).sum() == len(mesh.tets)
 
 
 def test_patches_do_not_cut_a_group() -> None:

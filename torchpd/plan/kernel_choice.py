@@ -179,8 +179,9 @@ class _PlanBuilder(NamedTuple):
         return patches if patches <= wave else -(-patches // wave) * wave
 
     def uses_pipeline(self, gpu: Properties) -> bool:
-        """Whether "stream" runs as a pipeline: float32, solids alone, no contacts, enough shared memory."""
+        """Whether "stream" runs as a pipeline: float32, Poisson's ratio 0, no contacts, enough shared memory."""
         others = len(self.values.planes) + len(self.values.spheres) + len(self.values.stencils) > 0
+        others = others or self.values.poisson is not None
         return self.dtype == torch.float32 and not others and gpu.shared >= _PIPELINE_BYTES
 
     def max_grid_patches(self, gpu: Properties) -> int:

@@ -102,11 +102,6 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=compiled.progress)
-    if values.poisson is not None and values.stencils:
-        raise RuntimeError(
-            "Simulator: device must be the CPU for scenes of Poisson's ratio and other bodies than solids, which "
-            f"no kernel for {device} takes together; keep it there, or leave poisson at 0"
-        )
     lacking = [group.kind for group in values.stencils if not KINDS[group.kind].on_gpu]
     if lacking:
         raise RuntimeError(

@@ -40,9 +40,10 @@ struct Cuda {
     return call.stencils.blocks > 0 ? call.stencils.stencil_sizes + stencil_size_count : nullptr;
   }
 
+  // With Poisson's ratio where the kernels for it read it.
   template <class Call>
-  static Call with_poisson(const Mixed<Call>& call) {
-    Call own = call;
+  static Mixed<Call> with_poisson(const Mixed<Call>& call) {
+    Mixed<Call> own = call;
     own.poisson = call.effects.poisson;
     return own;
   }
@@ -55,36 +56,40 @@ struct Cuda {
   }
   template <class Call>
   static bool is_mixed(const Mixed<Call>& call) {
-    TORCH_CHECK_NOT_IMPLEMENTED(
-        call.stencils.blocks == 0 || !call.effects.poisson.data,
-        "Poisson's ratio beside shells, threads or springs does not run on a GPU yet: "
-        "use device='cpu', or Solid(poisson=0)");
     return call.stencils.blocks > 0;
   }
 
   template <class T>
   static void step(const Step<T>& call, const Tensor& like) {
     const bool stream = call.plan.kernel == int(DeviceKernel::stream);
-    if (is_mixed(call))
-      return run(like, call, mixed_step_bytes<T>,
-                 stream ? run_mixed_stream<T> : run_mixed_block<T>);
     if (has_poisson(call)) {
-      const DeviceStep<T> own = with_poisson(call);
-      stream ? run<DeviceStep<T>>(like, own, poisson::stream_bytes<T>, poisson::run_stream<T>)
-             : run<DeviceStep<T>>(like, own, poisson::fused_bytes<T>, poisson::run_fused<T>);
+      const Step<T> own = with_poisson(call);
+      is_mixed(own) ? run(like, own, poisson::mixed_step_bytes<T>,
+                          stream ? poisson::run_mixed_stream<T> : poisson::run_mixed_block<T>)
+                    : run<DeviceStep<T>>(like, own, poisson::step_bytes<T>,
+                                         stream ? poisson::run_stream<T> : poisson::run_fused<T>);
     } else {
-      run<DeviceStep<T>>(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
+      is_mixed(call)
+          ? run(like, call, mixed_step_bytes<T>, stream ? run_mixed_stream<T> : run_mixed_block<T>)
+          : run<DeviceStep<T>>(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
     }
   }
 
   template <class T>
   static void field(const Field<T>& call, const Tensor& like) {
-    if (is_mixed(call)) return run(like, call, mixed_field_bytes<T>, run_mixed_field<T>);
     // what belongs to effects is zero
-    if (call.field == pd::Field::effect_energy || call.field == pd::Field::effect_products) return;
-    has_poisson(call)
-        ? run(like, with_poisson(call), poisson::field_bytes<T>, poisson::run_field<T>)
-        : run<DeviceField<T>>(like, call, field_bytes<T>, run_field<T>);
+    const bool of_effects =
+        call.field == pd::Field::effect_energy || call.field == pd::Field::effect_products;
+    if (of_effects && !is_mixed(call)) return;
+    if (has_poisson(call)) {
+      const Field<T> own = with_poisson(call);
+      is_mixed(own)
+          ? run(like, own, poisson::mixed_field_bytes<T>, poisson::run_mixed_field<T>)
+          : run<DeviceField<T>>(like, own, poisson::field_bytes<T>, poisson::run_field<T>);
+    } else {
+      is_mixed(call) ? run(like, call, mixed_field_bytes<T>, run_mixed_field<T>)
+                     : run<DeviceField<T>>(like, call, field_bytes<T>, run_field<T>);
+    }
   }
 
   template <class T>
@@ -100,10 +105,16 @@ struct Cuda {
 
   template <class T>
   static void conjugate(const Conjugate<T>& call, const Tensor& like) {
-    if (is_mixed(call)) return run(like, call, mixed_conjugate_bytes<T>, run_mixed_conjugate<T>);
-    has_poisson(call)
-        ? run(like, with_poisson(call), poisson::conjugate_bytes<T>, poisson::run_conjugate<T>)
-        : run<DeviceConjugate<T>>(like, call, conjugate_bytes<T>, run_conjugate<T>);
+    if (has_poisson(call)) {
+      const Conjugate<T> own = with_poisson(call);
+      is_mixed(own)
+          ? run(like, own, poisson::mixed_conjugate_bytes<T>, poisson::run_mixed_conjugate<T>)
+          : run<DeviceConjugate<T>>(like, own, poisson::conjugate_bytes<T>,
+                                    poisson::run_conjugate<T>);
+    } else {
+      is_mixed(call) ? run(like, call, mixed_conjugate_bytes<T>, run_mixed_conjugate<T>)
+                     : run<DeviceConjugate<T>>(like, call, conjugate_bytes<T>, run_conjugate<T>);
+    }
   }
 
   template <class T>

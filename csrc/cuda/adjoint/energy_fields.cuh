@@ -216,6 +216,7 @@ __global__ void __launch_bounds__(field_threads)
       T* to = work.field.out + (environment * plan.tets + tet) * Numbers;
       for (int n = 0; n < Numbers; ++n) to[n] = found[n];
       if constexpr (Numbers == 2) {
+        if (plan.pair_bound[place.in(2) + e * pair_lanes] < T(0)) to[1] = T(0);  // without lambda
         const T volume = e == 0 ? numbers.template weight<PairSide<T, 0>>(T(1))
                                 : numbers.template weight<PairSide<T, 1>>(T(1));
         LameSlopes<T>(moduli.youngs[tet], moduli.poisson[tet]).chain(volume, to);

@@ -108,7 +108,13 @@ __global__ void __launch_bounds__(field_threads)
   const std::int64_t block = thread / stencil_lanes % blocks;
   if (block >= plan.blocks) {
     const std::int64_t t = (block - plan.blocks) * stencil_lanes + thread % stencil_lanes;
-    if (t < tets) out[t] = work.field.stiffness.of(environment)[t];
+    const Moduli<T> moduli(work.field.stiffness, work.field.poisson, environment);
+    if (t >= tets) return;
+    if constexpr (has_poisson_ratio) {
+      out[t] = Lame<T>(moduli.youngs[t], moduli.poisson[t]).matrix();
+    } else {
+      out[t] = moduli.youngs[t];
+    }
     return;
   }
   const StencilPlace<T> place(plan, int(block));
@@ -196,7 +202,8 @@ void run_mixed_field_with(const MixedFieldWork<T>& work, cudaStream_t stream) {
 template <class T>
 void run_mixed_field(const MixedField<T>& field, void* memory, Stream to) {
   // of tetrahedra alone
-  if (field.field == Field::element_energy || field.field == Field::element_energy_product)
+  if (field.field == Field::element_energy || field.field == Field::element_energy_product ||
+      field.field == Field::lame_product)
     return run_field<T>(field, memory, to);
   const auto stream = static_cast<cudaStream_t>(to);
   Arena arena(memory);

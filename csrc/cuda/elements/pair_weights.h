@@ -13,11 +13,12 @@ PD_DEVICE void compute_group_weights(const DevicePlan<T>& plan, const Numbers& n
   const unsigned to = place.in(pair_weights) + Side::which * pair_lanes;
   const int tet = tet_of(plan, place, Side::which);
   const T volume = tet < 0 ? T(0) : numbers.template weight<Side>(T(1));
-  const Lame<T> lame(tet < 0 ? T(0) : moduli.youngs[tet], tet < 0 ? T(0) : moduli.poisson[tet]);
+  const T bound = plan.pair_bound[at];
+  Lame<T> lame(tet < 0 ? T(0) : moduli.youngs[tet], tet < 0 ? T(0) : moduli.poisson[tet]);
+  if (bound < T(0) && kind != WeightKind::matrix) lame.lambda = T(0);
   const bool coupled = plan.members == 4 && Side::which == 0 &&
                        plan.pair_coupled[place.in(1)] != 0 && kind == WeightKind::force;
-  const T weight =
-      volume * lame.of(kind, kind == WeightKind::majoriser ? plan.pair_bound[at] : T(1));
+  const T weight = volume * lame.of(kind, absolute(bound));
   weights[to] = coupled ? -weight : weight;
   weights[to + 2 * pair_lanes] = volume * lame.lambda;
 }

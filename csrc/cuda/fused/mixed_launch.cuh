@@ -13,6 +13,10 @@ extern template MixedKernel<double> mixed_kernel_for<double, true, true>(bool);
 template <class T>
 MixedKernel<T> mixed_kernel(const MixedStep<T>& step, bool in_shared) {
   if (has_contacts(step)) return mixed_kernel_for<T, true, true>(in_shared);
+  // fewer kernels with Poisson's ratio
+  if constexpr (has_poisson_ratio)
+    return has_free_pieces(step) ? mixed_kernel_for<T, true, true>(in_shared)
+                                 : mixed_kernel_for<T, false, false>(in_shared);
   return has_free_pieces(step) ? mixed_kernel_for<T, false, true>(in_shared)
                                : mixed_kernel_for<T, false, false>(in_shared);
 }

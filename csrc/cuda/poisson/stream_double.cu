@@ -6,4 +6,6 @@
 namespace pd {
 template std::int64_t stream_bytes(const DeviceStep<double>&);
 template void run_stream(const DeviceStep<double>&, void*, Stream);
+template std::int64_t mixed_stream_bytes(const MixedStep<double>&);
+template void run_mixed_stream(const MixedStep<double>&, void*, Stream);
 }  // namespace pd

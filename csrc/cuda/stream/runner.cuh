@@ -173,8 +173,7 @@ class StreamRunner {
   }
 
   void weights(std::int64_t sets, WeightKind kind) {
-    if constexpr (!has_poisson_ratio)
-      if (stencils_) return run_mixed_weights(call_, sets, kind, stream_);
+    if (stencils_) return run_mixed_weights(call_, sets, kind, stream_);
     launcher_.run(stream_weights<T>, sets, vertex_threads, 0, call_, kind);
   }
 
@@ -198,16 +197,13 @@ class StreamRunner {
                              piped ? round : 0u);
   }
 
-  // Runs a pass of a scene with stencils; those with Poisson's ratio have none.
+  // Runs a pass of a scene with stencils.
   template <Visit What>
   bool run_mixed(int k) {
-    if constexpr (!has_poisson_ratio) {
-      if (stencils_)
-        run_mixed_pass<T, HasContacts>(What, MixedStreamCall<T>{call_, *stencils_}, patches_,
-                                       pass_shared_, k, stream_);
-      return stencils_ != nullptr;
-    }
-    return false;
+    if (stencils_)
+      run_mixed_pass<T, HasContacts>(What, MixedStreamCall<T>{call_, *stencils_}, patches_,
+                                     pass_shared_, k, stream_);
+    return stencils_ != nullptr;
   }
 
   // Runs an iteration's patches as a pipeline if shared memory holds two of them. The number of
@@ -298,12 +294,7 @@ void run_stream_with(const StreamCall<T>& call, void* multilevel_memory,
                      const StencilWork<T>* stencils, cudaStream_t stream) {
   const std::size_t bytes =
       pass_shared_bytes(sizeof(T), call.step.plan.most_slots, call.step.plan.most_entries, 2);
-  if constexpr (has_poisson_ratio) {
-    allow_shared_memory<T, HasContacts>(bytes);
-  } else {
-    stencils ? allow_mixed_passes<T, HasContacts>(bytes)
-             : allow_shared_memory<T, HasContacts>(bytes);
-  }
+  stencils ? allow_mixed_passes<T, HasContacts>(bytes) : allow_shared_memory<T, HasContacts>(bytes);
   StreamRunner<T, HasContacts>(call, multilevel_memory, stencils, stream).rollout();
 }
 

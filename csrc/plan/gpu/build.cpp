@@ -66,7 +66,9 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, c
   for (int which = 0; which < 2; ++which) {
     const Rest rest =
         rest_of(mesh.elements.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
-    plan.pair_bound[(2 * block + which) * lanes + lane] = rest.bound;
+    const bool traceless =
+        pair.tet[which] >= 0 && !mesh.elements.averaged.has_trace(pair.tet[which]);
+    plan.pair_bound[(2 * block + which) * lanes + lane] = traceless ? -rest.bound : rest.bound;
     if (!plan.pair_factor.empty())
       plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
     volume[which] = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
@@ -243,13 +245,17 @@ void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pie
     plan.piece_part[next[part_piece[part]]++] = std::int32_t(part);
 }
 
-// Replaces groups by their tetrahedra.
+// Replaces groups by their tetrahedra, which count before the stencils.
 void expand_groups(Mesh& mesh, const MeshElements& elements) {
   const Partition groups = std::move(mesh.partition);
   mesh.partition = {{}, {0}};
   mesh.group.resize(elements.tet_count);
   for (int p = 0; p < groups.patches(); ++p) {
     for (const std::int32_t g : groups.patch(p)) {
+      if (g >= elements.solids()) {
+        mesh.partition.elements.push_back(std::int32_t(g - elements.solids() + elements.tet_count));
+        continue;
+      }
       for (int m = 0; m < elements.members(g); ++m) {
         mesh.partition.elements.push_back(elements.member(g, m));
         mesh.group[elements.member(g, m)] = g;

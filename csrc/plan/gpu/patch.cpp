@@ -90,6 +90,8 @@ void order_pairs(MeshPatch& patch, int number, const Numbering& numbering) {
 template <class Number>
 void add_stencils(MeshPatch& patch, const MeshElements& all, std::span<const std::int32_t> elements,
                   const Number& local) {
+  // MeshElements counts groups of tetrahedra
+  const std::int64_t shift = all.solids() - all.tet_count;
   std::int64_t first = all.tet_count;
   auto next = elements.begin();
   for (std::size_t g = 0; g < all.groups.size(); first += all.groups[g++].count) {
@@ -97,7 +99,7 @@ void add_stencils(MeshPatch& patch, const MeshElements& all, std::span<const std
     own.group = int(g);
     for (; next != elements.end() && *next < first + all.groups[g].count; ++next) {
       own.number.push_back(std::int32_t(*next - first));
-      for (const std::int64_t v : all.corners(*next)) own.corner.push_back(local(v));
+      for (const std::int64_t v : all.corners(*next + shift)) own.corner.push_back(local(v));
     }
     if (!own.number.empty()) patch.stencils.push_back(std::move(own));
   }

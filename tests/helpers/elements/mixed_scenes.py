@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from cases import Case, box
@@ -18,8 +19,8 @@ def _case(*parts: object) -> Case:
     return stirred(Case(scene, rest, 0.0 * rest, 1.0 / 60.0), size=0.002)
 
 
-def _block(cells: tuple[int, int, int] = (3, 2, 2)) -> pd.Solid:
-    return pd.Solid(pd.TetMesh(*box((0.3, 0.2, 0.2), cells)), 2e5)
+def _block(poisson: float = 0.0, averaging: int | None = None) -> pd.Solid:
+    return pd.Solid(pd.TetMesh(*box((0.3, 0.2, 0.2), (3, 2, 2))), 2e5, poisson=poisson, averaging=averaging)
 
 
 def sheet_case(cells: tuple[int, int] = (6, 5)) -> Case:
@@ -44,26 +45,29 @@ def rod_case() -> Case:
     return _case(body, pd.Pin(body, [0, 1]), pd.Gravity())
 
 
-def spring_case() -> Case:
-    """Two blocks joined by springs, one of them held."""
-    body, other = _block(), pd.Solid(pd.TetMesh(*box((0.2, 0.2, 0.2), (2, 2, 2))).translated((0.35, 0.0, 0.0)), 1e5)
+def spring_case(**ratio: Any) -> Case:
+    """Two blocks joined by springs, one of them held; `ratio`: that of Poisson and the averaging of one of them."""
+    body, other = (
+        _block(**ratio),
+        pd.Solid(pd.TetMesh(*box((0.2, 0.2, 0.2), (2, 2, 2))).translated((0.35, 0.0, 0.0)), 1e5),
+    )
     pairs = [[len(body.mesh.vertices) - 1, 0], [len(body.mesh.vertices) - 2, 3], [5, 7]]
     springs = pd.Springs(body, pairs, [300.0, 500.0, 200.0], [0.02, 0.1, 0.3], other=other)
     return _case(body, other, springs, pd.Pin(body, [0, 1, 2]), pd.Gravity())
 
 
-def fibre_case() -> Case:
+def fibre_case(**ratio: Any) -> Case:
     """A held block with active fibres and others that resist tension alone."""
-    body = _block()
+    body = _block(**ratio)
     tets = np.arange(len(body.mesh.tets))
     active = pd.Fibres(body, (1.0, 0.2, 0.0), 3e5, activation=0.7, tets=tets[::2])
     passive = pd.Fibres(body, (0.0, 1.0, 0.3), 2e5, tension_only=True, tets=tets[1::3])
     return _case(body, active, passive, pd.Pin(body, body.mesh.vertices[:, 0] == 0.0), pd.Gravity())
 
 
-def mixed_case(*parts: object) -> Case:
+def mixed_case(*parts: object, **ratio: Any) -> Case:
     """Solid, cloth tied to it, a rod, springs and fibres, with contacts."""
-    solid = _block()
+    solid = _block(**ratio)
     mesh = surface(size=(0.4, 0.3), cells=(5, 4)).translated((0.05, 0.2, 0.0))
     sheet = cloth(mesh, bending=1e-4, poisson=0.2, weft=100.0, grain=(1.0, 0.0, 0.0))
     points = np.stack([np.linspace(0.0, 0.5, 9), np.full(9, 0.4), np.full(9, 0.1)], axis=1)
@@ -85,4 +89,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "springs": spring_case,
     "fibres": fibre_case,
     "mixed": mixed_case,
+    # each tetrahedron has its own trace, averages it with another one, or with up to three
+    "fibres, poisson": lambda: fibre_case(poisson=0.36, averaging=1),
+    "springs, poisson": lambda: spring_case(poisson=0.3, averaging=2),
+    "mixed, poisson": lambda: mixed_case(poisson=0.38, averaging=4),
 }
