@@ -57,7 +57,7 @@ def of_sheet(problem: Sheet) -> Energy:
         torch.from_numpy(a) for a in (membrane.corners, membrane.gradients, membrane.measure)
     )
     corners, total = torch.from_numpy(hinge.corners), torch.from_numpy(hinge.measure)
-    rest = torch.from_numpy(problem.mesh.vertices)
+    rest = torch.tensor(problem.mesh.vertices)
     lengths = (rest[corners[:, 1]] - rest[corners[:, 0]]).square().sum(1)
     mu, bend = 0.5 * problem.youngs, problem.bending * lengths / total
 

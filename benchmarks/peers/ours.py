@@ -22,15 +22,17 @@ def _start(problem: Problem, sim: pd.Simulator) -> pd.State:
     return state
 
 
-def _compiled(problem: Problem, device: str, time_step: float, solver: Solver | str) -> tuple[pd.Simulator, pd.State]:
+def _compiled(
+    problem: Problem, device: str, time_step: float, solver: Solver | str, dtype: torch.dtype = torch.float32
+) -> tuple[pd.Simulator, pd.State]:
     iterations = None if solver == "auto" else 64
-    sim = pd.Simulator(problem.scene(), time_step, iterations, solver, batch=1, progress=False).to(device)
+    sim = pd.Simulator(problem.scene(), time_step, iterations, solver, dtype, batch=1, progress=False).to(device)
     return sim, _start(problem, sim)
 
 
-def step(problem: Problem, device: str, solver: Solver, name: str) -> Method:
+def step(problem: Problem, device: str, solver: Solver, name: str, dtype: torch.dtype = torch.float32) -> Method:
     """One step with n iterations."""
-    sim, state = _compiled(problem, device, problem.time_step, solver)
+    sim, state = _compiled(problem, device, problem.time_step, solver, dtype)
 
     @torch.no_grad()
     def run(iterations: int) -> Array:

@@ -12,7 +12,8 @@ OURS = {
     "MuJoCo flex, substeps": "torchpd, substeps",
 }  # fmt: skip
 COLOURS = {
-    "torchpd Chebyshev": "tab:blue", "torchpd Multilevel": "tab:cyan", "torchpd, substeps": "tab:blue",
+    "torchpd Chebyshev": "tab:blue", "torchpd Chebyshev, float64": "tab:gray", "torchpd Multilevel": "tab:cyan",
+    "torchpd, substeps": "tab:blue",
     "Newton VBD": "tab:orange", "Newton XPBD": "tab:red", "Newton Style3D": "tab:purple",
     "MuJoCo flex, substeps": "tab:green",
 }  # fmt: skip
