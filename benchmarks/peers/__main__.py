@@ -74,7 +74,7 @@ def _solvers(problem: Problem, device: str) -> dict[str, Callable[[], tuple[Meth
     def neo_hookean() -> tuple[Method, Answer]:
         method = newton_physics.vbd(problem, device)
         if isinstance(problem, Sheet):
-            return method, converged.minimise(problem, converged.of_sheet(problem), method.run(LONGEST_OF_CLOTH))
+            return method, converged.minimise(problem, converged.of_sheet(problem), method.run(LONGEST))
         density = converged.stable_neo_hookean(problem.youngs / 2.0, 0.0)
         return method, converged.minimise(problem, converged.of_tetrahedra(problem, density))
 
