@@ -1,4 +1,4 @@
-"""One step of a body in Newton's SolverVBD and SolverXPBD, in MuJoCo's flex, and here: error against time.
+"""One step of a body or a cloth in Newton's solvers, in MuJoCo's flex, and here: error against time.
 
 All have the same mesh, lumped masses, density, Young's modulus, gravity, time step 1/30 s and start; the Poisson ratio
 is 0 where the method allows it. A method is judged by the distance from its own converged solution,
@@ -9,12 +9,16 @@ VBD and XPBD take one step with n iterations, as this library does. u* of VBD is
 its own longest run agrees with that to the rounding of float32. u* of XPBD is its longest run, if that has settled.
 MuJoCo has no iterations: it and this library take the same 1/30 s in n steps, and u* has the most steps.
 
+Cloth has no contact with itself. Its step is 1/60 s, in VBD and Style3D. Style3D's forces have no energy: u* is
+where they balance, by Newton's method in float64.
+
 Newton and MuJoCo are optional: pip install newton warp-lang mujoco. Missing ones are reported and left out.
 Measured cases are kept: an interrupted run resumes.
 
     python -m benchmarks.peers --cells 3 5 8 12 --youngs 1e4 1e5 1e6 1e7 --out benchmarks/results/peers-cpu.json
     python -m benchmarks.peers --device cuda --cells 3 5 8 12 --out benchmarks/results/peers-cuda.json
     python -m benchmarks.peers --mesh bunny.mesh
+    python -m benchmarks.peers --cells --cloth hanging folded --out benchmarks/results/peers-cloth-cpu.json
 """
 
 from __future__ import annotations
@@ -35,18 +39,21 @@ from tqdm.auto import tqdm
 
 import torchpd as pd
 from torchpd.common.provenance import describe_run
+from torchpd.scene.solvers import Solver
 
-from . import converged, mujoco_flex, newton_physics, ours
-from .problem import Array, Method, MissingPackageError, Problem, beam, from_file
+from . import converged, mujoco_flex, newton_physics, ours, style3d
+from .problem import Array, Method, MissingPackageError, Problem, Sheet, beam, folded, from_file, hanging
 from .report import draw, table
 
 GOALS = (1e-1, 1e-2, 1e-3)
 LONGEST = 4096  # iterations of a method
+LONGEST_OF_CLOTH = 4 * LONGEST
 # substeps of a frame; the last gives the converged solution
 SUBSTEPS = {
     "torchpd, substeps": [2**k for k in range(10)],
     "MuJoCo flex, substeps": [2**k for k in range(10)],
 }
+CLOTH: dict[str, Callable[[float], Problem]] = {"hanging": hanging, "folded": folded}
 SETTLED = 1e-2  # relative change over the second half of a longest run
 Row = dict[str, Any]
 Answer = tuple[Array, float]  # u* and its remaining residual, or the change of the last doubling
@@ -66,16 +73,38 @@ def _solvers(problem: Problem, device: str) -> dict[str, Callable[[], tuple[Meth
 
     def neo_hookean() -> tuple[Method, Answer]:
         method = newton_physics.vbd(problem, device)
-        return method, converged.minimise(problem, converged.stable_neo_hookean(problem.youngs / 2.0, 0.0))
+        if isinstance(problem, Sheet):
+            return method, converged.minimise(problem, converged.of_sheet(problem), method.run(LONGEST))
+        density = converged.stable_neo_hookean(problem.youngs / 2.0, 0.0)
+        return method, converged.minimise(problem, converged.of_tetrahedra(problem, density))
 
     def constraints() -> tuple[Method, Answer]:
         method = newton_physics.xpbd(problem, device)
         return method, _own_end(method, 4 * LONGEST if len(problem.mesh.vertices) < 1000 else LONGEST)
 
+    def springs() -> tuple[Method, Answer]:
+        assert isinstance(problem, Sheet)
+        method = newton_physics.style3d(problem, device)
+        return method, style3d.balance(problem, exact[0])
+
+    def ours_by(solver: Solver, dtype: torch.dtype = torch.float32) -> tuple[Method, Answer]:
+        method = ours.step(problem, device, solver, f"torchpd {type(solver).__name__}", dtype)
+        # a folded sheet has several minima: each solver has its own
+        own = isinstance(problem, Sheet) and not isinstance(solver, pd.Chebyshev)
+        return method, ours.converged(problem, solver) if own else exact
+
     exact = ours.converged(problem)
+    if isinstance(problem, Sheet):
+        return {
+            "torchpd Chebyshev": lambda: ours_by(pd.Chebyshev()),
+            "torchpd Chebyshev, float64": lambda: ours_by(pd.Chebyshev(), torch.float64),
+            "torchpd Multilevel": lambda: ours_by(pd.Multilevel("lbfgs")),
+            "Newton VBD": neo_hookean,
+            "Newton Style3D": springs,
+        }
     return {
-        "torchpd Chebyshev": lambda: (ours.step(problem, device, pd.Chebyshev(), "torchpd Chebyshev"), exact),
-        "torchpd Multilevel": lambda: (ours.step(problem, device, pd.Multilevel(), "torchpd Multilevel"), exact),
+        "torchpd Chebyshev": lambda: ours_by(pd.Chebyshev()),
+        "torchpd Multilevel": lambda: ours_by(pd.Multilevel()),
         "Newton VBD": neo_hookean,
         "Newton XPBD": constraints,
     }
@@ -108,9 +137,10 @@ def measure(problem: Problem, name: str, method: Method, end: Answer, counts: li
 
 def run_problem(problem: Problem, options: argparse.Namespace, known: dict[str, Row]) -> list[Row]:
     """A row for every method; missing or refused methods keep a row with the reason."""
-    iterations = [2**k for k in range(int(np.log2(LONGEST)) + 1)]
+    longest = LONGEST_OF_CLOTH if isinstance(problem, Sheet) else LONGEST
+    iterations = [2**k for k in range(int(np.log2(longest)) + 1)]
     cases = {name: (make, iterations) for name, make in _solvers(problem, options.device).items()}
-    if len(problem.mesh.vertices) <= options.frames:
+    if len(problem.mesh.vertices) <= options.frames and not isinstance(problem, Sheet):
         cases.update({name: (make, SUBSTEPS[name][:-2]) for name, make in _frames(problem, options.device).items()})
     rows = []
     for name, (make, counts) in cases.items():
@@ -137,8 +167,8 @@ def _measured(
 ) -> Row:
     try:
         method, end = make()
-    except RuntimeError as reason:
-        tqdm.write(f"{problem.name}, {problem.youngs:g} Pa, {name}: {reason}")
+    except (RuntimeError, ValueError) as reason:  # the latter from Multilevel, which does not take cloth on a GPU
+        tqdm.write(f"{problem.name}, {problem.youngs:g} {problem.unit}, {name}: {reason}")
         return {
             "method": name,
             "refused": str(reason),
@@ -170,7 +200,11 @@ def main(words: list[str]) -> None:
         "--cells", type=int, nargs="*", default=[3, 5], help="cells of beams: 3 5 8 12 have 256 to 10309 vertices"
     )
     parser.add_argument("--mesh", nargs="*", default=[], help="tetrahedral meshes, besides the beams")
+    parser.add_argument("--cloth", nargs="*", choices=CLOTH, default=[], help="sheets of 961 vertices")
     parser.add_argument("--youngs", type=float, nargs="*", default=[1e4, 1e5, 1e6, 1e7], help="Young's moduli [Pa]")
+    parser.add_argument(
+        "--membrane", type=float, nargs="*", default=[1e3, 1e4], help="Young's modulus times thickness of cloth [N/m]"
+    )
     parser.add_argument(
         "--seconds", type=float, default=5.0, help="time limit of a run, after which a method stops (%(default)g)"
     )
@@ -192,14 +226,15 @@ def main(words: list[str]) -> None:
     sources = [*(lambda youngs, c=cells: beam(c, youngs) for cells in options.cells),
                *(lambda youngs, p=path: from_file(p, youngs) for path in options.mesh)]  # fmt: skip
     cases = [(make, youngs) for make in sources for youngs in options.youngs]
+    cases += [(CLOTH[name], youngs) for name in options.cloth for youngs in options.membrane]
     for make, youngs in tqdm(cases, desc="problems", unit="problem"):
         problem = make(youngs)
         known = {
             m["method"]: m for m in rows.get((problem.name, youngs), {}).get("methods", []) if not m.get("missing")
         }
         rows[problem.name, youngs] = {
-            "problem": problem.name, "vertices": len(problem.mesh.vertices), "tets": len(problem.mesh.tets),
-            "youngs": youngs, "methods": run_problem(problem, options, known),
+            "problem": problem.name, "vertices": len(problem.mesh.vertices), "elements": len(problem.body().elements),
+            "youngs": youngs, "unit": problem.unit, "methods": run_problem(problem, options, known),
         }  # fmt: skip
         if options.out:
             options.out.parent.mkdir(parents=True, exist_ok=True)

@@ -15,17 +15,24 @@ from .timing import fastest
 Array = NDArray[np.float64]
 
 
-def _compiled(problem: Problem, device: str, time_step: float, solver: Solver | str) -> tuple[pd.Simulator, pd.State]:
-    iterations = None if solver == "auto" else 64
-    sim = pd.Simulator(problem.scene(), time_step, iterations, solver, batch=1, progress=False).to(device)
+def _start(problem: Problem, sim: pd.Simulator) -> pd.State:
     state = sim.rest_state()
-    state.velocities[:] = torch.from_numpy(problem.velocities).to(state.velocities)
-    return sim, state
+    state.positions[:] = torch.tensor(problem.start).to(state.positions)
+    state.velocities[:] = torch.tensor(problem.velocities).to(state.velocities)
+    return state
 
 
-def step(problem: Problem, device: str, solver: Solver, name: str) -> Method:
+def _compiled(
+    problem: Problem, device: str, time_step: float, solver: Solver | str, dtype: torch.dtype = torch.float32
+) -> tuple[pd.Simulator, pd.State]:
+    iterations = None if solver == "auto" else 64
+    sim = pd.Simulator(problem.scene(), time_step, iterations, solver, dtype, batch=1, progress=False).to(device)
+    return sim, _start(problem, sim)
+
+
+def step(problem: Problem, device: str, solver: Solver, name: str, dtype: torch.dtype = torch.float32) -> Method:
     """One step with n iterations."""
-    sim, state = _compiled(problem, device, problem.time_step, solver)
+    sim, state = _compiled(problem, device, problem.time_step, solver, dtype)
 
     @torch.no_grad()
     def run(iterations: int) -> Array:
@@ -40,13 +47,14 @@ def step(problem: Problem, device: str, solver: Solver, name: str) -> Method:
     return Method(name, run, milliseconds)
 
 
-def converged(problem: Problem) -> tuple[Array, float]:
+def converged(problem: Problem, solver: Solver | None = None) -> tuple[Array, float]:
     """The converged step in float64, and |grad E| there over that at the start."""
-    sim = pd.Simulator(problem.scene(), problem.time_step, 400, pd.Multilevel(), torch.float64, progress=False)
-    state = sim.rest_state()
-    state.velocities[:] = torch.from_numpy(problem.velocities)
+    exact, iterations = problem.exact
+    sim = pd.Simulator(
+        problem.scene(), problem.time_step, iterations, solver or exact, torch.float64, progress=False
+    )  # fmt: skip
     with torch.no_grad():
-        after, info = sim(state, return_info=True)
+        after, info = sim(_start(problem, sim), return_info=True)
     return np.asarray(after.velocities[0] * sim.time_step), float(info.residual)
 
 

@@ -8,11 +8,14 @@ from typing import Any
 Row = dict[str, Any]
 
 OURS = {
-    "Newton VBD": "torchpd", "Newton XPBD": "torchpd", "MuJoCo flex, substeps": "torchpd, substeps",
+    "Newton VBD": "torchpd", "Newton XPBD": "torchpd", "Newton Style3D": "torchpd",
+    "MuJoCo flex, substeps": "torchpd, substeps",
 }  # fmt: skip
 COLOURS = {
-    "torchpd Chebyshev": "tab:blue", "torchpd Multilevel": "tab:cyan", "torchpd, substeps": "tab:blue",
-    "Newton VBD": "tab:orange", "Newton XPBD": "tab:red", "MuJoCo flex, substeps": "tab:green",
+    "torchpd Chebyshev": "tab:blue", "torchpd Chebyshev, float64": "tab:gray", "torchpd Multilevel": "tab:cyan",
+    "torchpd, substeps": "tab:blue",
+    "Newton VBD": "tab:orange", "Newton XPBD": "tab:red", "Newton Style3D": "tab:purple",
+    "MuJoCo flex, substeps": "tab:green",
 }  # fmt: skip
 
 
@@ -65,8 +68,9 @@ def table(rows: list[Row], goals: tuple[float, ...]) -> str:
             else:
                 cells = [cell(row["methods"], peer, goal) for goal in goals]
                 apart = f"{peer['own_answer_from_ours']:.1g}"
+            unit = row.get("unit", "Pa")
             lines.append(
-                f"| {row['problem']} | {row['youngs']:.0e} Pa | {peer['method']} | {apart} | "
+                f"| {row['problem']} | {row['youngs']:.0e} {unit} | {peer['method']} | {apart} | "
                 + " | ".join(cells)
                 + " |"
             )
@@ -97,7 +101,12 @@ def draw(rows: list[Row], path: Path) -> None:
                 colour = COLOURS[method["method"]]
                 panel.plot(*zip(*points, strict=True), style, marker=".", color=colour, label=method["method"])
         panel.set_visible(True)
-        panel.set(xscale="log", yscale="log", ylim=(3e-4, 10.0), title=f"{row['problem']}\n{row['youngs']:.0e} Pa")
+        panel.set(
+            xscale="log",
+            yscale="log",
+            ylim=(3e-4, 10.0),
+            title=f"{row['problem']}\n{row['youngs']:.0e} {row.get('unit', 'Pa')}",
+        )
         panel.title.set_fontsize(9)
         panel.grid(alpha=0.3)
         panel.set_xlabel("milliseconds")

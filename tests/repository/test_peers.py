@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 from programs import ROOT
 
 import torchpd as pd
+from torchpd.reference.problem import elastic_energy
 
 
 @pytest.fixture
@@ -30,7 +32,8 @@ def test_the_minimiser_finds_our_own_step(peers: Any) -> None:
         # |F - R|^2 = sum (sigma - 1)^2 while nothing is inverted
         return 0.5 * problem.youngs * (torch.linalg.svdvals(f) - 1.0).square().sum(-1)
 
-    found, left = peers("converged").minimise(problem, density)
+    converged = peers("converged")
+    found, left = converged.minimise(problem, converged.of_tetrahedra(problem, density))
     ours, _ = peers("ours").converged(problem)
     assert left < 1e-8
     assert problem.error(found, ours) < 1e-6
@@ -46,6 +49,40 @@ def test_neo_hookean_agrees_for_small_strain(peers: Any) -> None:
     expected = 0.5 * strain.square().sum((1, 2))
     # what is left out is of third order
     assert torch.allclose(risen, expected, rtol=5e-3)
+
+
+def test_cloth_of_the_other_solver_agrees_for_small_strain_and_angles(peers: Any, monkeypatch: Any) -> None:
+    """Its energy is ours but for third orders: at strains of 1e-3, and at angles of 1e-3 with strains of 1e-6."""
+    monkeypatch.setattr(peers("problem"), "SHEET_CELLS", 5)
+    for axes, bending in (([0, 2], 1e-6), ([1], 0.7)):
+        problem = dataclasses.replace(peers("problem").hanging(1e3), bending=bending)
+        x = problem.mesh.vertices.copy()
+        x[:, axes] += np.random.default_rng(0).uniform(-2e-4, 2e-4, (len(x), len(axes)))
+        found = float(peers("converged").of_sheet(problem)(torch.from_numpy(x)))
+        assert found == pytest.approx(elastic_energy(problem.scene().values(), x), rel=5e-3)
+
+
+def test_cloth_of_springs_balances_where_ours_does(peers: Any, monkeypatch: Any) -> None:
+    """In tension and for small shear the three springs are the membrane; what is left has the order of the strain."""
+    monkeypatch.setattr(peers("problem"), "SHEET_CELLS", 6)
+    problem = peers("problem").hanging(1e3)
+    ours, residual = peers("ours").converged(problem)
+    found, left = peers("style3d").balance(problem, problem.first)
+    assert max(left, residual) < 1e-9
+    assert problem.error(found, ours) < 1e-5
+    assert not (found[problem.held] - problem.first[problem.held]).any()
+
+
+def test_the_folded_cloth_moves_and_is_held_by_two_corners(peers: Any, monkeypatch: Any) -> None:
+    monkeypatch.setattr(peers("problem"), "SHEET_CELLS", 6)
+    problem = peers("problem").folded(1e3)
+    assert len(problem.held) == 2
+    assert np.array_equal(problem.start[problem.held], problem.mesh.vertices[problem.held])
+    # a free fall of 24 steps is 24 * 25 / 2 g h^2 = 0.82 m
+    assert problem.start[:, 1].min() == pytest.approx(-0.82, abs=0.05)
+    chebyshev, _ = peers("ours").converged(problem)
+    step = peers("ours").step(problem, "cpu", pd.Chebyshev(), "torchpd Chebyshev")
+    assert problem.error(step.run(2000), chebyshev) < 1e-3
 
 
 def test_a_file_is_held_and_thrown_like_the_beam(peers: Any, tmp_path: Path) -> None:
@@ -89,7 +126,8 @@ def test_a_table_says_who_is_faster_and_what_failed(peers: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("module", "make", "missing"), [("newton_physics", "vbd", "newton"), ("mujoco_flex", "flex", "mujoco")]
+    ("module", "make", "missing"),
+    [("newton_physics", "vbd", "newton"), ("newton_physics", "style3d", "newton"), ("mujoco_flex", "flex", "mujoco")],
 )
 def test_what_is_not_installed_is_named(
     peers: Any, module: str, make: str, missing: str, monkeypatch: pytest.MonkeyPatch
