@@ -133,6 +133,7 @@ def draw(record: Row, path: Path) -> None:
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
     panels: dict[str, list[Row]] = {}
     for row in record["rows"]:
@@ -149,6 +150,7 @@ def draw(record: Row, path: Path) -> None:
                 place.loglog(across, down, style, color=f"C{number}", label=name)
             place.plot(row["default"]["milliseconds"], row["default"]["error"], "*", color=f"C{number}", markersize=12)
         place.set(xlabel="milliseconds of a step", ylim=(3e-5, 2.0))
+        place.xaxis.set_minor_formatter(NullFormatter())
         place.grid(alpha=0.3)
         place.legend(fontsize="small")
     axes[0][0].set_ylabel("error of the step")

@@ -13,7 +13,7 @@ import torch
 from cloth import sheet
 
 import torchpd as pd
-from torchpd.scene.solvers import Chebyshev, Solver
+from torchpd.scene.solvers import Solver
 
 GRAVITY = (0.0, -9.8, 0.0)
 
@@ -28,8 +28,8 @@ class EffectScene:
     start: Callable[[pd.State], None]  # changes the state of rest
     steps_before: int = 0  # nearly converged steps from there
 
-    def simulator(self, dtype: torch.dtype, iterations: int | None, solver: Solver | str = Chebyshev()) -> pd.Simulator:
-        """A simulator of the scene on the CPU."""
+    def simulator(self, dtype: torch.dtype, iterations: int | None, solver: Solver | str | None = None) -> pd.Simulator:
+        """A simulator of the scene on the CPU; Chebyshev without a solver."""
         return pd.Simulator(self.scene(), self.time_step, iterations, solver, dtype, progress=False)
 
     @torch.no_grad()
@@ -85,7 +85,7 @@ def _mixed_scene() -> pd.Scene:
 
 
 def _draped_scene() -> pd.Scene:
-    """A sheet whose middle is tied to the upper face of a cube with fibres; its corners fall, and it buckles at the cube's edges."""
+    """A sheet, its middle tied to the top of a cube with fibres. The corners fall, and it buckles over the edges."""
     cube = pd.shapes.box((0.4, 0.4, 0.4), (6, 6, 6))
     body = pd.Solid(cube, youngs=1e5, poisson=0.3)
     cloth = pd.Cloth(sheet((20, 20)).translated((-0.3, 0.4, -0.3)), 1e6, 1e-3, 0.2, bending=1e-5)
