@@ -102,6 +102,15 @@ def run_scene(name: str, device: torch.device, seconds: float) -> Row:
     return row
 
 
+def rows_of(name: str, device: torch.device, seconds: float) -> list[Row]:
+    """The row of a scene; none, and a line that says why, where the device has no kernels for it."""
+    try:
+        return [run_scene(name, device, seconds)]
+    except (RuntimeError, NotImplementedError) as refusal:
+        print(f"{name}: {refusal}")
+        return []
+
+
 def first_at(points: list[Row], goal: float) -> Row | None:
     """The first point within an error."""
     return next((point for point in points if point["error"] <= goal), None)
@@ -178,10 +187,7 @@ def main() -> None:
     result = describe_run(device, options.threads)
     result["rows"] = []
     for name in tqdm(options.scenes, desc="accuracy", unit="scene"):
-        try:
-            result["rows"].append(run_scene(name, device, options.seconds))
-        except (RuntimeError, NotImplementedError) as refusal:  # an effect without kernels on this device
-            print(f"{name}: {refusal}")
+        result["rows"] += rows_of(name, device, options.seconds)
     print(table(result["rows"]))
     if options.out is not None:
         write_result(options.out, result)

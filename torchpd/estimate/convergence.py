@@ -19,8 +19,8 @@ rigid rotations, it is an upper bound: the count of Chebyshev. `Simulator.tune` 
 One formula holds for every kind of element. At rest the smallest eigenvalue is 1.0 to 1.5 times mu for the scenes of
 `benchmarks/effect_scenes.py`: solids with a Poisson ratio, cloth, a rod and a mixture. Where nothing buckles, Chebyshev
 needs 0.5 to 2.3 times the estimate there. A compressed sheet or rod resists less than not at all in the direction in
-which it buckles: its second derivative is negative. Then the smallest eigenvalue falls below mu, 0.27 to 0.8 of it in
-the steps that were measured, and these needed up to 9 times the estimate. Weights cannot tell which steps these are.
+which it buckles: its second derivative is negative. Then the smallest eigenvalue falls below mu, 0.27 to 0.94 of it in
+some of the measured steps, which needed 1.1 to 9 times the estimate. Weights cannot tell which steps these are.
 """
 
 from __future__ import annotations
