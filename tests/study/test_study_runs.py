@@ -119,7 +119,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert all(word in said for word in ("--axes", "spot.obj", "SUBJECT before"))
     assert main(["study", "nothing.obj", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert all(word in said for word in ("SUBJECT", "beam, octopus", "nothing.obj"))
+    assert all(word in said for word in ("SUBJECT", "beam, cloth, octopus", "nothing.obj"))
 
 
 @pytest.fixture
