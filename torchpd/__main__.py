@@ -27,8 +27,9 @@ Measures the cost of accuracy: error of the solver against iterations, milliseco
 methods. Also measures the errors of the time step, of the mesh and of float32, and the effect of unconverged steps on
 a motion.
 
-SUBJECT is beam, octopus, or a mesh file. Bodies land on the ground. Methods without contacts (Newton, L-BFGS,
-Gauss-Seidel, conjugate gradients, a factorised step) are refused there; with --scene held all methods run.
+SUBJECT is beam, cloth (a hanging sheet), octopus, or a mesh file. Bodies land on the ground. Methods without contacts
+(Newton, L-BFGS, Gauss-Seidel, conjugate gradients, a factorised step) are refused there; with --scene held all methods
+run.
 
 Results go to --out: study.json, study.csv, pictures and report.html. An interrupted study resumes."""
 
@@ -89,11 +90,16 @@ def _add_study(commands: Any) -> None:
         description=_STUDY,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    study.add_argument("subject", nargs="?", default="beam", metavar="SUBJECT", help="beam, octopus or a mesh file")
+    study.add_argument(
+        "subject", nargs="?", default="beam", metavar="SUBJECT", help="beam, cloth, octopus or a mesh file"
+    )
     study.add_argument("--scene", help="motion of a body: lands (default), or held at its lowest tenth, no contacts")
     study.add_argument("--youngs", type=_positive, help="Young's modulus in Pa")
+    study.add_argument("--poisson", type=float, default=0.0, help="Poisson's ratio (%(default)s)")
     study.add_argument("--time-step", type=_positive, help="time step in s")
-    study.add_argument("--resolution", type=_whole, help="cells across the beam, or along the longest side of a body")
+    study.add_argument(
+        "--resolution", type=_whole, help="cells across the beam or cloth, or along the longest side of a body"
+    )
     study.add_argument("--iterations", type=_whole, default=1024, help="most iterations per step (%(default)s)")
     study.add_argument("--axes", nargs="+", metavar="AXIS", help="only these: solver, stiffness, float, time-step, ...")
     study.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")

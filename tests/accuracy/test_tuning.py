@@ -15,6 +15,7 @@ from torchpd.accuracy.candidates import safe_candidates
 from torchpd.accuracy.error import ExactStep, exact_steps, settled_steps
 from torchpd.accuracy.tuning import TuningWarning
 from torchpd.accuracy.tuning_result import Trial
+from torchpd.study.scenes import study_scene
 
 
 @pytest.mark.parametrize("error", [1e-1, 1e-3])
@@ -319,3 +320,16 @@ def test_the_hardest_states_of_the_motion_are_studied() -> None:
         state = after
     # 0.46 from the states of five fixed steps
     assert worst <= result.error
+
+
+def test_hanging_cloth_is_tuned() -> None:
+    """The motion is that of the default solver, and its steps reach the error."""
+    studied = study_scene("cloth", poisson=0.3)
+    mesh = studied.mesh(8)
+    sim = pd.Simulator(studied.scene(mesh, 1e6), 1 / 60, dtype=torch.float64, iterations=64, progress=False)
+    start = studied.start(sim)
+    result = sim.tune(start, error=1e-2)
+    assert result.attained
+    state = sim.rollout(start, 3, every=3).state()
+    exact = exact_steps(sim, state)[0]
+    assert exact.position_error((sim(state).velocities[0] * sim.time_step).numpy()) <= 1e-2

@@ -387,3 +387,17 @@ def test_what_a_gradient_costs() -> None:
     row = measure_scene((2, 1, 1), 1, 1e5, "Chebyshev", torch.device("cpu"), 0.0, "multilevel")
     assert row["backward"] > 0
     assert "| Chebyshev, multilevel adjoint made in 2 s |" in line_of({**row, "making": 2.0})
+
+
+def test_accuracy_by_kind_counts_iterations_and_draws(tmp_path: Path) -> None:
+    """Errors fall with the iterations to the smallest goal, and the picture is written beside the rows."""
+    out = tmp_path / "rod.json"
+    said = run("accuracy_by_kind.py", "--scenes", "rod", "--seconds", "0", "--out", str(out))
+    assert "rod, 1e7 Pa, Chebyshev" in said
+    (row,) = json.loads(out.read_text())["rows"]
+    points = row["solvers"]["Chebyshev"]["points"]
+    assert points[0]["error"] > 0.5 > 1e-3 >= points[-1]["error"]
+    assert row["auto"]["solver"] == "Chebyshev"
+    assert row["default"]["error"] > 0.1
+    run("accuracy_by_kind.py", "--draw", str(out))
+    assert out.with_suffix(".png").stat().st_size > 1000

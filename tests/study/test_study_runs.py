@@ -17,6 +17,7 @@ from torchpd.__main__ import main
 from torchpd.geometry.shapes import box
 from torchpd.study import AXES, StudyOptions, run_study, study_rows
 from torchpd.study import tasks as study
+from torchpd.study.axes import baseline_rows, candidate_rows
 from torchpd.study.bench import Bench, Setting
 from torchpd.study.results_log import Row
 from torchpd.study.scenes import study_scene
@@ -118,7 +119,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert all(word in said for word in ("--axes", "spot.obj", "SUBJECT before"))
     assert main(["study", "nothing.obj", "--out", str(tmp_path)]) == 2
     said = capsys.readouterr().err
-    assert all(word in said for word in ("SUBJECT", "beam, octopus", "nothing.obj"))
+    assert all(word in said for word in ("SUBJECT", "beam, cloth, octopus", "nothing.obj"))
 
 
 @pytest.fixture
@@ -181,6 +182,28 @@ def test_held_are_the_vertices_of_the_lowest_tenth(bar: str) -> None:
         study_scene("beam", "held")
     with pytest.raises(ValueError, match=r"--scene .*lands, held.*'flies'"):
         study_scene(bar, "flies")
+
+
+def test_cloth_is_studied() -> None:
+    """Every method runs on it; rows count triangles, and a step has the error of the simulator itself."""
+    bench = Bench(study_scene("cloth"), CPU, series=1, seconds=0.0)
+    setting = Setting(1e5, 1 / 60, 5)
+    rows = candidate_rows(bench, "guarded Chebyshev", torch.float64, setting, [8, 512])
+    assert [row.tets for row in rows] == [50, 50]
+    assert rows[0].error > 1e-3 > 1e-9 > rows[1].error
+    newton = baseline_rows(bench, "Newton", setting, [8])
+    assert min(row.error for row in newton) < 1e-9
+
+
+def test_poissons_ratio_is_studied() -> None:
+    bench = Bench(study_scene("beam", poisson=0.45), CPU, series=1, seconds=0.0)
+    sim = bench.simulator(Setting(1e5, 1 / 30, 1), torch.float64)
+    assert sim.scene.solids[0].poisson == pytest.approx(0.45)
+    assert StudyOptions(poisson=0.45).command() == "python -m torchpd study beam --poisson 0.45"
+    with pytest.raises(ValueError, match=r"poisson.*0\.6"):
+        Bench(study_scene("beam", poisson=0.6), CPU).simulator(Setting(1e5, 1 / 30, 1), torch.float64)
+    with pytest.raises(ValueError, match=r"--scene .*cloth.*'held'"):
+        study_scene("cloth", "held")
 
 
 def test_a_tetrahedral_mesh_lands(bar: str) -> None:

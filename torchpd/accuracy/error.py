@@ -54,8 +54,10 @@ Array = NDArray[np.float64]
 
 # Solvers of exact steps, with iterations between checks of the residual. The first is the best by far without contacts.
 # With contacts, each solves scenes on which the others stagnate.
-_FIRST = 50  # of the schedule that `multilevel_for` names
-_OTHERS: tuple[tuple[Solver, int], ...] = ((Multilevel("momentum"), 100), (Chebyshev(), 500))
+_SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 50), (Multilevel("momentum"), 100), (Chebyshev(), 500))
+# With other parts, a step has several minima where something buckles: the one that the default solver goes to counts.
+_OF_STENCILS: tuple[tuple[Solver, int], ...] = ((Chebyshev(), 2000), (Multilevel("lbfgs"), 50))
+_LONG = 40_000  # least limit of iterations there
 _SOLVED = 1e-13  # residual at which a solver ends
 _NEARLY = 1e-9  # residual that may be the lowest that rounding allows
 _PATIENCE = 3  # checks without a halved residual before a solver ends; one if all are below _NEARLY
@@ -240,6 +242,9 @@ def exact_steps(
     `Multilevel` runs in float64 on the CPU until the residual stops falling. Newton's method follows if the result is
     uncertain, with contacts or without. Other solvers then continue from the best result so far.
 
+    With cloth, rods and other parts besides solids, Chebyshev goes first. Where these buckle a step has several minima.
+    Errors are against the one that the default solver reaches; `Multilevel` may end in another.
+
     `ExactStep.uncertainty` bounds the remaining error. Where the elements are stable, |grad E| / min m/h^2 >= |u - u*|.
     Another bound is twice the next step of Newton's method, which is far shorter for stiff bodies. If the uncertainty
     is large, there is no converged step to compare with.
@@ -250,13 +255,15 @@ def exact_steps(
         forces: [B, V, 3] N.
         targets: as in `Simulator.forward`.
         start: u_0 of the errors: "velocity", h v, or the "inertial" first iterate.
-        iterations: most of each solver.
+        iterations: most of each solver; of Chebyshev 40,000 with parts besides solids.
     """
     # independent of torch's default device
     with torch.device("cpu"):
         search = _Search(sim, state, forces, targets, start)
-        for solver, chunk in ((multilevel_for(sim.compiled), _FIRST), *_OTHERS):
-            search.iterate(solver, chunk, iterations)
+        several = sim.compiled.has_stencils
+        for solver, chunk in _OF_STENCILS if several else _SOLVERS:
+            most = max(iterations, _LONG) if several and isinstance(solver, Chebyshev) else iterations
+            search.iterate(solver, chunk, most)
             search.polish(_FINE[sim.dtype])
             if search.sure:
                 break

@@ -33,7 +33,7 @@ from ..scene.solvers import Chebyshev, Multilevel, Solver
 from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
 from ..simulation.state import State
-from .candidates import multilevel_for, safe_candidates
+from .candidates import safe_candidates
 from .error import ExactStep, exact_steps, settled_steps
 from .tuning_checks import check_known, check_request, check_start
 from .tuning_result import Trial, TuningResult
@@ -56,7 +56,7 @@ _ENVIRONMENTS = 3  # of a batch, besides the worst conditioned one
 _HEADROOM = 0.95  # share of a budget in milliseconds to spend, because times scatter
 _NEAR = 1.1  # the first candidate within this factor of the fastest time is taken
 _HOPELESS = 1.5  # a candidate beyond this factor of the fastest time is dropped
-# iterations that produce the studied states: of Multilevel, and of Chebyshev if that does not run or there is friction
+# iterations that produce the studied states: of Multilevel; of Chebyshev if that does not run, or may stagnate
 _MOVING, _MOVING_PLAINLY = 64, 512
 # uncertainty at which steps with friction count as settled: this share of the requested error, or of _COARSE
 _SETTLED, _COARSE = 1e-2, 1e-2
@@ -263,9 +263,9 @@ def _motion(sim: Stepper, start: State, forces: Tensor | None) -> list[State]:
     states in which the energy is not convex, and all solvers leave these slowly.
     """
     mover = copy.copy(sim)
-    multilevel = multilevel_for(mover.compiled)
-    if runs(multilevel, mover.compiled) and not has_friction(mover.compiled):
-        mover.solver, mover.iterations = multilevel, _MOVING
+    smooth = not (has_friction(mover.compiled) or mover.compiled.has_stencils)
+    if smooth and runs(Multilevel(), mover.compiled):
+        mover.solver, mover.iterations = Multilevel(), _MOVING
     else:
         mover.solver, mover.iterations = Chebyshev(), _MOVING_PLAINLY
     prober = copy.copy(mover)

@@ -15,6 +15,12 @@ With smooth planes the estimate of `Multilevel` is for the impact of a stiff bod
 It is two square roots of the count of Chebyshev. With slivers or strongly varying stiffness it is at least a seventh of
 that count. Most steps need far fewer. With friction, spheres, cloth or rods, and with schedules that do not treat
 rigid rotations, it is an upper bound: the count of Chebyshev. `Simulator.tune` measures instead.
+
+One formula holds for every kind of element. At rest the smallest eigenvalue is 1.0 to 1.5 times mu for the scenes of
+`benchmarks/effect_scenes.py`: solids with a Poisson ratio, cloth, a rod and a mixture. Where nothing buckles, Chebyshev
+needs 0.5 to 2.3 times the estimate there. A compressed sheet or rod resists less than not at all in the direction in
+which it buckles: its second derivative is negative. Then the smallest eigenvalue falls below mu, 0.27 to 0.94 of it in
+some of the measured steps, which needed 1.1 to 9 times the estimate. Weights cannot tell which steps these are.
 """
 
 from __future__ import annotations

@@ -24,6 +24,7 @@ from .bench import (
     Setting,
     Timing,
     clock_of,
+    elements_of,
     measure_step,
     precision_name,
     row_statuses,
@@ -93,7 +94,7 @@ def baseline_rows(bench: Bench, name: str, setting: Setting, counts: list[int]) 
     most = min(max(counts), _NEWTON_ITERATIONS) if method.few else max(counts)
     common: dict[str, Any] = {
         "axis": "solver", "method": name, "compiled": False, "parts": method.parts, "youngs": setting.youngs,
-        "time_step": setting.time_step, "vertices": len(exact.first), "tets": len(exact.problem.values.tets),
+        "time_step": setting.time_step, "vertices": len(exact.first), "tets": elements_of(exact),
         "uncertainty": exact.uncertainty,
     }  # fmt: skip
     try:
@@ -138,7 +139,7 @@ def dense_rows(bench: Bench, name: str, dtype: torch.dtype, setting: Setting, co
     problem = exact.problem
     common: dict[str, Any] = {
         "axis": "solver", "method": name, "precision": precision_name(dtype), "youngs": setting.youngs,
-        "time_step": setting.time_step, "vertices": len(exact.first), "tets": len(problem.values.tets),
+        "time_step": setting.time_step, "vertices": len(exact.first), "tets": elements_of(exact),
         "uncertainty": exact.uncertainty,
     }  # fmt: skip
     sim = bench.simulator(setting, dtype)
@@ -194,7 +195,7 @@ def float_rows(bench: Bench, setting: Setting, counts: list[int]) -> list[Row]:
             Row(
                 axis="float", method=DEFAULT, precision="float32", iterations=count, local_steps=count,
                 youngs=setting.youngs, time_step=setting.time_step, vertices=sims[0].vertices,
-                tets=len(exact.problem.values.tets), error=error,
+                tets=elements_of(exact), error=error,
                 error_metres=float(np.linalg.norm(off, axis=1).max()), **timing.columns(),
             )
         )  # fmt: skip
@@ -247,7 +248,7 @@ def _motion_rows(bench: Bench, axis: str, runs: list[tuple[Setting, int]]) -> li
             Row(
                 axis=axis, method="solved", status="ok" if motion.solved and exact.solved else "uncertain",
                 iterations=motion.steps, youngs=setting.youngs, time_step=setting.time_step,
-                vertices=motion.vertices, tets=len(bench.mesh(setting.resolution).tets),
+                vertices=motion.vertices, tets=bench.elements(setting.resolution),
                 error=float(np.linalg.norm(off) / np.linalg.norm(exact.displacement)),
                 error_metres=float(np.linalg.norm(off, axis=1).max()),
                 error_energy=abs(motion.energy - exact.energy) / exact.initial_kinetic,

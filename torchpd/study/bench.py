@@ -18,6 +18,7 @@ from ..api.simulator import Simulator
 from ..common.warn import warn_user
 from ..files.summary import workspace_bytes
 from ..geometry.tet_mesh import TetMesh
+from ..geometry.tri_mesh import TriMesh
 from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver
 from ..simulation.state import State
 from .results_log import Row, Trajectory
@@ -31,6 +32,7 @@ __all__ = [
     "UncertainWarning",
     "clock_of",
     "count_kernels",
+    "elements_of",
     "measure_step",
     "precision_name",
     "row_statuses",
@@ -41,6 +43,7 @@ __all__ = [
 # steps of which only one error is measured are solved by these, in turn
 SOLVED = 1e-9
 _SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 300), (Chebyshev(), 3000))
+_OF_STENCILS: tuple[tuple[Solver, int], ...] = ((Chebyshev(), 20000),)  # other parts: the minimum of the default
 _UNCERTAINTY_LIMIT = 0.1  # limit of the uncertainty of the converged step, over the error measured against it
 _SMALLEST_SHOWN = 1e-8  # smaller errors appear in no figure or table
 _SCATTER = 1.3  # 95th over 5th percentile of times on a machine that is busy with other work
@@ -69,15 +72,20 @@ class Bench:
     device: torch.device
     series: int = 6  # series of times, if they scatter
     seconds: float = 0.05  # least duration of a series
-    _meshes: dict[int, TetMesh] = field(default_factory=dict)
+    _meshes: dict[int, TetMesh | TriMesh] = field(default_factory=dict)
     _steps: dict[Setting, tuple[State, ExactStep]] = field(default_factory=dict)
     motions: dict[tuple[Setting, float], Trajectory] = field(default_factory=dict)  # converged motions, by duration
 
-    def mesh(self, resolution: int) -> TetMesh:
+    def mesh(self, resolution: int) -> TetMesh | TriMesh:
         """The mesh of the study scene at a resolution."""
         if resolution not in self._meshes:
             self._meshes[resolution] = self.study_scene.mesh(resolution)
         return self._meshes[resolution]
+
+    def elements(self, resolution: int) -> int:
+        """Number of tetrahedra, or of triangles of cloth."""
+        mesh = self.mesh(resolution)
+        return len(mesh.tets if isinstance(mesh, TetMesh) else mesh.triangles)
 
     def simulator(
         self, setting: Setting, dtype: torch.dtype, solver: Solver | None = None, **options: Any
@@ -242,15 +250,22 @@ def row_statuses(errors: Sequence[float], uncertainty: float = 0.0, energies: Se
     return found
 
 
+def elements_of(exact: ExactStep) -> int:
+    """Number of tetrahedra of a step, or of triangles without any."""
+    values = exact.problem.values
+    triangles = sum(len(group.corners) for group in values.stencils if group.kind == "triangle")
+    return len(values.tets) or triangles
+
+
 @torch.no_grad()
 def solved_step(sim: Simulator, state: State) -> tuple[State, bool]:
     """A step in float64, solved to a relative error of about 1e-9, and whether that was reached.
 
-    Multilevel solves it; where it fails, Chebyshev continues.
+    Multilevel solves it; where it fails, and with cloth, Chebyshev does.
     """
     sim.tolerance = SOLVED
     guess: str | torch.Tensor = "velocity"
-    for solver, iterations in _SOLVERS:
+    for solver, iterations in _OF_STENCILS if sim.compiled.has_stencils else _SOLVERS:
         sim.solver, sim.iterations = solver, iterations
         after, info = sim(state, start=guess, return_info=True)
         if bool(info.converged.all()):
@@ -287,7 +302,7 @@ def measure_step(
         local_steps=iterations,
         status=row_statuses([errors.position], exact.uncertainty, [errors.energy])[0],
         vertices=sim.vertices,
-        tets=len(exact.problem.values.tets),
+        tets=elements_of(exact),
         time_step=sim.time_step,
         error=errors.position,
         uncertainty=exact.uncertainty,

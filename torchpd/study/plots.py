@@ -164,7 +164,7 @@ def _drawn_curves(rows: list[Row]) -> dict[str, list[Row]]:
 def _draw_solvers(rows: list[Row], path: Path, scene_name: str) -> Path:
     first = rows[0]
     figure, (left, right) = _figure(
-        2, f"{scene_name}: {max(row.tets for row in rows):,} tetrahedra, Young's modulus {_pascals(first.youngs)}, "
+        2, f"{scene_name}: {max(row.tets for row in rows):,} elements, Young's modulus {_pascals(first.youngs)}, "
         f"time step {first.time_step:.3g} s. One step.", width=6.6,
     )  # fmt: skip
     curves, refused = _drawn_curves(rows), dict[str, list[str]]()
@@ -261,7 +261,7 @@ def _draw_cost(rows: list[Row], path: Path, scene_name: str) -> Path:
     if not own:
         return path
     first = own[0]
-    title = f"{scene_name}, {first.tets:,} tetrahedra, float32: cost of accuracy on this machine"
+    title = f"{scene_name}, {first.tets:,} elements, float32: cost of accuracy on this machine"
     figure, (axis,) = _figure(1, title, width=8.2)
     shades = dict(zip(sorted({row.youngs for row in own}), _SHADES, strict=False))
     methods = list(dict.fromkeys(row.method for row in own))
@@ -319,7 +319,7 @@ def _draw_axes(rows: list[Row], path: Path, scene_name: str) -> Path:
         "error of the motion by its time step", slope=SLOPES["time step"],
     )  # fmt: skip
     _panel(
-        axes[1], by_axis.get("mesh", []), lambda row: row.tets, "tetrahedra", "error of the motion by its mesh",
+        axes[1], by_axis.get("mesh", []), lambda row: row.tets, "elements", "error of the motion by its mesh",
         slope=SLOPES["mesh"],
     )  # fmt: skip
     _panel(

@@ -132,7 +132,7 @@ def _figures(rows: list[Row]) -> list[Figure]:
                       _stiffness_figure(by_axis["stiffness"])))  # fmt: skip
     others: list[tuple[str, str, Callable[[Row], float], str]] = [
         ("time step", "Error of the time step", lambda row: row.time_step, "time step [s]"),
-        ("mesh", "Error of the mesh", lambda row: row.tets, "tetrahedra"),
+        ("mesh", "Error of the mesh", lambda row: row.tets, "elements"),
         ("float", "Float32 against float64", lambda row: row.iterations, axis_label("iterations")),
         ("trajectory", "A second of motion", lambda row: row.iterations, axis_label("iterations")),
     ]

@@ -34,7 +34,7 @@ class Row:
     youngs: float = 0.0  # Pa
     time_step: float = 0.0  # s
     vertices: int = 0
-    tets: int = 0
+    tets: int = 0  # or triangles of cloth
     error: float = math.inf  # relative, of positions
     uncertainty: float | None = None  # of the reference solution, in the unit of the error
     error_energy: float | None = None  # relative

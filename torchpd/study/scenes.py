@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from ..geometry import shapes
 from ..geometry.tet_mesh import TetMesh
 from ..geometry.tetrahedralize import tetrahedralize
 from ..geometry.tri_mesh import TriMesh
+from ..scene.cloth import Cloth
 from ..scene.effects import Gravity, Ground, Pin, Solid
 from ..scene.scene import Scene
 from ..simulation.state import State
@@ -30,6 +32,7 @@ _GAP = 0.002  # m between the ground and a body before it lands
 _LANDING = (0.3, -2.0, 0.0)  # m/s
 _HELD = 0.1  # held part, over the height of a body
 _SWING = 2.0  # m/s at its top
+_THICKNESS, _AREA_DENSITY = 1e-3, 0.2  # of the sheet: m, kg/m^2
 
 
 @dataclass(frozen=True)
@@ -41,10 +44,10 @@ class StudyScene:
     """
 
     name: str
-    mesh: Callable[[int], TetMesh]
-    scene: Callable[[TetMesh, float], Scene]  # built for a Young's modulus [Pa]
+    mesh: Callable[[int], Any]  # TetMesh, or TriMesh of cloth
+    scene: Callable[..., Scene]  # (mesh, Young's modulus [Pa], poisson=)
     start: Callable[[Simulator], State]
-    probes: Callable[[TetMesh, Array], Array]
+    probes: Callable[[Any, Array], Array]
     resolution: int
     resolutions: tuple[int, ...]  # of the mesh study; the finest is its reference, a single one means no mesh study
     youngs: float  # Pa
@@ -59,8 +62,8 @@ def _beam_mesh(resolution: int) -> TetMesh:
     return shapes.box((1.0, 0.2, 0.2), (5 * resolution, resolution, resolution))
 
 
-def _beam_scene(mesh: TetMesh, youngs: float) -> Scene:
-    body = Solid(mesh, youngs=youngs, density=DENSITY)
+def _beam_scene(mesh: TetMesh, youngs: float, poisson: float = 0.0) -> Scene:
+    body = Solid(mesh, youngs=youngs, poisson=poisson, density=DENSITY)
     return Scene(body, Pin(body, mesh.vertices[:, 0] == 0.0), Gravity((0.0, -9.8, 0.0)))
 
 
@@ -80,11 +83,46 @@ def _beam_probes(mesh: TetMesh, positions: Array) -> Array:
     return positions[found[order]]
 
 
+# ---- a sheet: hangs along x from the edge x = 0 and is thrown sideways; it stays in tension, and does not buckle
+
+
+def _sheet_mesh(resolution: int) -> TriMesh:
+    steps = np.linspace(0.0, 1.0, resolution + 1)
+    x, z = (grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+    i, j = (grid.ravel() for grid in np.meshgrid(np.arange(resolution), np.arange(resolution), indexing="ij"))
+    a = i * (resolution + 1) + j
+    b, c, d = a + resolution + 1, a + resolution + 2, a + 1
+    cut = ((i + j) % 2 == 1)[:, None]  # diagonals in turn
+    halves = (
+        np.where(cut, np.stack([a, d, b], 1), np.stack([a, c, b], 1)),
+        np.where(cut, np.stack([b, d, c], 1), np.stack([a, d, c], 1)),
+    )
+    return TriMesh(np.stack([x, np.zeros_like(x), z], 1), np.concatenate(halves))
+
+
+def _sheet_scene(mesh: TriMesh, youngs: float, poisson: float = 0.0) -> Scene:
+    body = Cloth(mesh, youngs, _THICKNESS, _AREA_DENSITY, poisson=poisson, bending=1e-5)
+    return Scene(body, Pin(body, mesh.vertices[:, 0] == 0.0), Gravity((9.8, 0.0, 0.0)))
+
+
+def _sheet_start(sim: Simulator) -> State:
+    state = sim.rest_state()
+    state.velocities[..., 1] = 3.0 * state.positions[..., 0] ** 2
+    return state
+
+
+def _sheet_probes(mesh: TriMesh, positions: Array) -> Array:
+    """Points of a grid of 0.2 m, which are vertices at every resolution."""
+    fifths = 5.0 * mesh.vertices[:, (0, 2)]
+    found = np.flatnonzero((np.abs(fifths - fifths.round()) < 1e-9).all(1) & (fifths[:, 0] > 0.5))
+    return positions[found[np.lexsort(mesh.vertices[found].T.round(9))]]
+
+
 # ---- a body that lands, or is held
 
 
-def _landing_scene(mesh: TetMesh, youngs: float) -> Scene:
-    return Scene(Solid(mesh, youngs=youngs, density=DENSITY), Gravity((0.0, -9.8, 0.0)), Ground())
+def _landing_scene(mesh: TetMesh, youngs: float, poisson: float = 0.0) -> Scene:
+    return Scene(Solid(mesh, youngs=youngs, poisson=poisson, density=DENSITY), Gravity((0.0, -9.8, 0.0)), Ground())
 
 
 def _landing_start(sim: Simulator) -> State:
@@ -93,8 +131,8 @@ def _landing_start(sim: Simulator) -> State:
     return state
 
 
-def _held_scene(mesh: TetMesh, youngs: float) -> Scene:
-    body = Solid(mesh, youngs=youngs, density=DENSITY)
+def _held_scene(mesh: TetMesh, youngs: float, poisson: float = 0.0) -> Scene:
+    body = Solid(mesh, youngs=youngs, poisson=poisson, density=DENSITY)
     return Scene(body, Pin(body, _above_held(mesh.vertices[:, 1]) <= 0.0), Gravity((0.0, -9.8, 0.0)))
 
 
@@ -161,14 +199,36 @@ def _beam(scene: str | None = None) -> StudyScene:
     )
 
 
+def _sheet(scene: str | None = None) -> StudyScene:
+    if scene is not None:
+        raise ValueError(f"study: --scene is for bodies (octopus or a mesh), not for cloth, got {scene!r}")
+    return StudyScene(
+        "cloth",
+        _sheet_mesh,
+        _sheet_scene,
+        _sheet_start,
+        _sheet_probes,
+        resolution=30,
+        resolutions=(5, 10, 15, 20, 30, 40),
+        youngs=1e7,
+        time_step=1 / 60,
+    )
+
+
 STUDY_SCENES: dict[str, Callable[..., StudyScene]] = {  # by name, called with --scene
     "beam": _beam,
+    "cloth": _sheet,
     "octopus": lambda scene=None: _body("octopus", shapes.octopus(), scene),
 }
 
 
-def study_scene(name: str, scene: str | None = None) -> StudyScene:
+def study_scene(name: str, scene: str | None = None, poisson: float = 0.0) -> StudyScene:
     """A study scene by name, or from a mesh file (surface or tetrahedral); bodies move as one of `SCENES`."""
+    studied = _study_scene(name, scene)
+    return replace(studied, scene=partial(studied.scene, poisson=poisson)) if poisson else studied
+
+
+def _study_scene(name: str, scene: str | None) -> StudyScene:
     if name in STUDY_SCENES:
         return STUDY_SCENES[name](scene)
     path = Path(name)

@@ -59,6 +59,7 @@ class StudyOptions:
     subject: str = "beam"  # or "octopus", or a mesh file
     scene: str | None = None  # of a body: "lands" on the ground (default) or "held"
     youngs: float | None = None  # Pa; default: that of the study scene
+    poisson: float = 0.0
     time_step: float | None = None  # s
     resolution: int | None = None  # cells across the beam, or lattice cells along the longest side
     iterations: int = 1024  # upper limit per step
@@ -70,13 +71,14 @@ class StudyOptions:
 
     def title(self) -> str:
         """Heading of the figures."""
-        return ", ".join([Path(self.subject).name, *([self.scene] if self.scene else [])])
+        ratio = [f"Poisson's ratio {self.poisson:g}"] if self.poisson else []
+        return ", ".join([Path(self.subject).name, *([self.scene] if self.scene else []), *ratio])
 
     def command(self) -> str:
         """Command that repeats this study."""
         words = ["python -m torchpd study", self.subject]
         plain = StudyOptions()
-        for name in ("scene", "youngs", "time_step", "resolution", "iterations", "device", "threads", "out"):
+        for name in ("scene", "youngs", "poisson", "time_step", "resolution", "iterations", "device", "threads", "out"):
             value = getattr(self, name)
             if value != getattr(plain, name):
                 words.append(f"--{name.replace('_', '-')} {value}")
@@ -155,7 +157,7 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
 
 def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
     """Measure the tasks missing from the results log of `options.out`, and return all rows."""
-    studied = study_scene(options.subject, options.scene)
+    studied = study_scene(options.subject, options.scene, options.poisson)
     device = find_device(options.device)
     if options.threads is not None:
         torch.set_num_threads(options.threads)
@@ -164,6 +166,7 @@ def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
     options.out.mkdir(parents=True, exist_ok=True)
     settings = {
         "schema": SCHEMA, "subject": options.subject, "scene": options.scene, **asdict(setting),
+        **({"poisson": options.poisson} if options.poisson else {}),
         "iterations": options.iterations, "device": options.device, "threads": torch.get_num_threads(),
         "quick": options.quick,
     }  # fmt: skip

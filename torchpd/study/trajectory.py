@@ -136,7 +136,7 @@ def _motion_row(bench: Bench, sim: Simulator, setting: Setting, seconds: float) 
     return Row(
         axis="trajectory", method="", precision=precision_name(sim.dtype), iterations=iterations,
         local_steps=iterations, status=status, youngs=setting.youngs, time_step=setting.time_step,
-        vertices=sim.vertices, tets=len(bench.mesh(setting.resolution).tets),
+        vertices=sim.vertices, tets=bench.elements(setting.resolution),
         error=found["path"] if finite else math.inf, milliseconds=motion.milliseconds,
         more={**found, "seconds_of_motion": seconds},
     )  # fmt: skip
