@@ -213,8 +213,9 @@ class FusedRunner {
     if (!stencils_.work.plan.remembers) return;
     __syncthreads();
     const int before = (patch_.pairs + pair_lanes - 1) / pair_lanes;
-    pd::begin_stencils(stencils_.work, in_.environment, patch_.index, before,
-                       [from = origin_](unsigned corner, Vec3<T>(&x)[1]) { x[0] = at_corner(from, corner); });
+    pd::begin_stencils(
+        stencils_.work, in_.environment, patch_.index, before,
+        [from = origin_](unsigned corner, Vec3<T>(&x)[1]) { x[0] = at_corner(from, corner); });
     __syncthreads();
   }
 
