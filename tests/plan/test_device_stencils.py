@@ -154,7 +154,7 @@ def test_widths_and_types_follow_the_table() -> None:
     tensors = compile_device_plan(values, 3, STREAM, torch.float32)
     for row, array in zip(device_table(values), tensors, strict=True):
         assert array.dtype == {"int32": torch.int32, "real": torch.float32, "int16": torch.int16}[row.type]
-    assert [len(tensors), len(DEVICE_STENCIL_TABLE)] == [len(DEVICE_PLAN_TABLE) + 8, 8]
+    assert [len(tensors), len(DEVICE_STENCIL_TABLE)] == [len(DEVICE_PLAN_TABLE) + 9, 9]
     assert not has_preconditioner(tensors)
     assert has_preconditioner(tensors[: len(DEVICE_PLAN_TABLE)] + tuple(MULTILEVEL_TABLE))
 
