@@ -70,7 +70,7 @@ struct KindShape {
   bool of_tets;  // whether it reads the material of tetrahedra
   std::vector<std::string> rows;
   const char* meaning;
-  bool on_gpu;  // whether a GPU has kernels for it
+  bool large;  // see elements/stencil.h
 };
 
 std::vector<KindShape> kind_shapes() {
@@ -84,7 +84,7 @@ std::vector<KindShape> kind_shapes() {
                    pd::reads_tets<pd::type>, \
                    {},                       \
                    what,                     \
-                   pd::runs_on_gpu<pd::type>});
+                   pd::is_large<pd::type>});
 #define PARAMETER(name, array) kinds.back().rows.push_back(#array);
 #include "elements/kinds.def"
 #undef KIND
@@ -144,7 +144,8 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std
           gradient.data(),
           measure.data(),
           constant.data(),
-          row ? row->data() : nullptr};
+          row ? row->data() : nullptr,
+          shape.large};
 }
 
 // Checks the elements of a scene; the arrays stay the caller's.
@@ -373,7 +374,7 @@ py::list kind_table() {
   py::list rows;
   for (const KindShape& kind : kind_shapes())
     rows.append(py::make_tuple(kind.name, kind.corners, kind.dims, kind.constants,
-                               py::tuple(py::cast(kind.rows)), kind.meaning, kind.on_gpu));
+                               py::tuple(py::cast(kind.rows)), kind.meaning));
   return rows;
 }
 
@@ -427,7 +428,7 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes,
                         int spheres, bool own_stiffness, bool own_effects) {
   const bool levels = level_sizes.size() > 0, stencils = stencil_sizes.size() > 0;
   if (sizes.size() != pd::size_count || (levels && level_sizes.size() != pd::level_size_count) ||
-      (stencils && stencil_sizes.size() < pd::stencil_size_count))
+      (stencils && stencil_sizes.size() != pd::stencil_size_count + int(pd::KindNumber::count)))
     throw py::value_error("sizes, level_sizes and stencil_sizes must be those of a plan for a GPU");
   pd::MixedStep<T> step;
   step.plan = pd::count_device_plan<T>(sizes.data());
@@ -438,9 +439,9 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes,
   step.material.spheres_count = spheres;
   step.material.stiffness.stride = own_stiffness ? step.plan.tets : 0;
   if (stencils) {
-    step.stencils.blocks = stencil_sizes.data()[pd::stencil_blocks];
-    step.stencils.number_rows = stencil_sizes.data()[pd::stencil_number_rows];
+    step.stencils = pd::count_device_stencils<T>(stencil_sizes.data());
   }
+  step.effects.stiffness = step.material.stiffness;
   // whichever of them it is
   step.effects.bending.stride = own_effects ? 1 : 0;
   return bytes_of(step);
@@ -491,7 +492,7 @@ PYBIND11_MODULE(_C, m) {
       "stencil_table", [] { return table(stencil_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays of stencils, in op order.");
   m.def("kind_table", &kind_table,
-        "Rows (name, corners, dims, constants, arrays, meaning, on_gpu) of the kinds of stencils.");
+        "Rows (name, corners, dims, constants, arrays, meaning) of the kinds of stencils.");
   m.def(
       "multilevel_table", [] { return table(multilevel_rows); },
       "Rows (name, type, width, rows, meaning) of a preconditioner's arrays, in op order.");

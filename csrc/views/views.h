@@ -130,6 +130,8 @@ struct DeviceStencils {
 #include "views/gpu_stencils.def"
 #undef X
   int blocks = 0, number_rows = 0;  // blocks of 32 stencils; rows of 32 numbers of a step
+  bool remembers = false;           // some stencils have numbers of the start of a step
+  bool reads_tets = false;          // some read the material of tetrahedra
 };
 
 // A call on a GPU with what only scenes with stencils have; blocks = 0 without them.
@@ -302,6 +304,11 @@ enum class Field : int {
   damping_start,  // derivative of gradient times direction by the positions at the start of the step
   damping_products
 };
+
+inline bool is_of_damping(Field field) {
+  return field == Field::damping_gradient || field == Field::damping_product ||
+         field == Field::damping_start || field == Field::damping_products;
+}
 
 template <class T, class P = Plan<T>>
 struct FieldCall : P::EffectViews {

@@ -60,7 +60,6 @@ class Kind(NamedTuple):
     constants: int  # further constants of a stencil
     rows: tuple[str, ...]  # names of its arrays in the material
     meaning: str
-    on_gpu: bool  # whether a GPU has kernels for it
 
     @property
     def of_tets(self) -> bool:

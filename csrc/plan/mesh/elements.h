@@ -17,6 +17,7 @@ struct StencilGroup {
   const double* measure = nullptr;       // [count] V
   const double* constant = nullptr;      // [count, constants]
   const std::int64_t* row = nullptr;     // [count] of the material; null: their own numbers
+  bool large = false;                    // see elements/stencil.h
 };
 
 // Tetrahedra in groups that average their trace, see elements/corotated.h: a partition never cuts one.
