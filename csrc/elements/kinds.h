@@ -100,12 +100,19 @@ struct ArraysOf {
     of_tets = is_of_tets(effect[0]);
   }
   PD_HD constexpr int width(int array) const { return first[array + 1] - first[array]; }
+  // whether a scene may lack an array, which is zero then
+  PD_HD constexpr bool may_lack(int wanted) const {
+    for (int i = 0; i < count; ++i) {
+      if (effect[i] == wanted) return of_tets || (quadratic_arrays<Kind> > 0 && i >= quadratic_arrays<Kind>);
+    }
+    return false;
+  }
   // all arrays have the same rows, and as many numbers as the kind reads
   constexpr bool fit() const {
     for (int i = 0; i < count; ++i) {
       if (is_of_tets(effect[i]) != of_tets) return false;
     }
-    return first[count] == Kind::rows;
+    return first[count] == Kind::rows && (quadratic_arrays<Kind> == 0 || Kind::dims == 1);
   }
 };
 #define KIND(name, type, what) static_assert(ArraysOf<type>().fit());
@@ -121,7 +128,7 @@ template <class Kind>
 constexpr bool runs_on_gpu = memory_of<Kind> == 0 && !reads_tets<Kind> &&
                              ArraysOf<Kind>().first[array_count<Kind>] == array_count<Kind>;
 
-// The rows of those arrays in one environment. An array of tetrahedra that the scene lacks has zeros.
+// The rows of those arrays in one environment. An array that the scene lacks has zeros.
 template <class Kind, class T>
 struct MaterialRows {
   const T* row[array_count<Kind>];
