@@ -23,7 +23,7 @@ from torchpd.scene.stencils import KINDS as SCENE_KINDS
 from torchpd.scene.stencils import StencilGroup
 
 PLANS = [(BLOCK, 1), (STREAM, 1), (STREAM, 7)]
-FLAT = ("free sheet", "mixed", "mixed, poisson")
+FLAT = ("free sheet", "flat sheet", "ties", "mixed", "mixed, poisson")
 Reals = NDArray[np.floating]
 
 
@@ -69,7 +69,8 @@ class Rows:
         """Sums of w g_a . g_b, and of the same times l_e."""
         stencil, corner = np.divmod(plan.row_term, 32)
         block, lane = np.divmod(stencil, LANES)
-        weight, product = np.zeros(len(stencil)), np.zeros(len(stencil))
+        # in the precision of the plan, as a GPU computes them
+        weight, product = (np.zeros(len(stencil), plan.stencil_stored.dtype) for _ in range(2))
         for group in quadratic(values):
             here = plan.stencil_block[block, 0] == list(KINDS).index(group.kind)
             order = plan.stencil_order[block, lane][here]
@@ -77,13 +78,14 @@ class Rows:
             g = plan.stencil_stored[edges, lane[here][:, None]]
             g = np.concatenate([-g.sum(axis=1, keepdims=True), g], axis=1)
             rows = np.arange(len(g))
-            weight[here] = weights(group)[order] * (plan.stencil_measure[block, lane][here] != 0.0)
+            weight[here] = weights(group)[order]
+            assert (plan.stencil_measure[block, lane][here] > 0.0).all()  # no padding
             product[here] = g[rows, corner[here] // 5] * g[rows, corner[here] % 5]
         terms = weight * product
         ends = plan.term_start
 
         def sums(terms: Reals) -> Reals:
-            return np.array([terms[a:b].sum() for a, b in itertools.pairwise(ends)])
+            return np.array([terms[a:b].sum() for a, b in itertools.pairwise(ends)], terms.dtype)
 
         return np.stack([sums(terms), sums(terms * plan.stencil_bound[block, lane])])
 
@@ -195,7 +197,8 @@ def test_float32_rows_are_as_near_as_stencils() -> None:
     x = mesh.vertices + 0.02 * np.sin(9.0 * mesh.vertices[:, [2, 0, 1]])
     exact, _ = forces_of(values, x)
     narrow = x.astype(np.float32)
-    rows = Rows(arrays_of(values, 1, BLOCK), values)
+    rows = Rows(arrays_of(values, 1, BLOCK, torch.float32), values)
+    assert rows.t.dtype == np.float32
     found = rows.gathered(rows.forces(narrow), len(x))
     today, _ = forces_of(values, narrow)
     error, own = (float(np.linalg.norm(force - exact) / np.linalg.norm(exact)) for force in (found, today))

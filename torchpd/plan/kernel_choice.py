@@ -183,6 +183,8 @@ class _PlanBuilder(NamedTuple):
         if self.uses_pipeline(gpu) and patches > gpu.multiprocessors:
             wave = gpu.multiprocessors
             patches = max(wave, math.ceil(tets / (_PIPELINE_GROWTH * _STREAM_TETS[self.dtype])))
+        if self.row_corners > 0 and gpu.multiprocessors < patches < wave:
+            return wave  # the patches of rows are large, so that idle places would show
         return patches if patches <= wave else -(-patches // wave) * wave
 
     def uses_pipeline(self, gpu: Properties) -> bool:

@@ -237,7 +237,11 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   auto* entries = reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), w.plan.most_slots, 2));
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const Vec3<T> position = vec3(w.origin[patch.first_slot + s]) + vec3(w.v.u[patch.vertex(s)]);
-    slots.set(s, position, rest.position[s].bits());
+    if (has_tets) {
+      slots.set(s, position, rest.position[s].bits());
+    } else {
+      slots.set_first(s, position);  // only tetrahedra read rest positions
+    }
   }
   __syncthreads();
   const auto shape_of = [&](int, const TetInputs<T>& numbers, const Quad<T>(&loaded)[4]) {
