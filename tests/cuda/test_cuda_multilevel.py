@@ -26,7 +26,7 @@ require_gpu()
 pytestmark = pytest.mark.usefixtures("poisoned")
 
 SOLVERS = {outer: pd.Multilevel(outer) for outer in ("lbfgs", "momentum", "corotated")}
-# one block; several; a middle level; pieces; contacts of every kind
+# one block; several; a middle level; pieces; contacts of every kind; Poisson's ratio
 CASES: dict[str, Callable[[], Case]] = {
     "slivers": slivers,
     "beam": lambda: beam(1e6),
@@ -38,6 +38,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "sliding": lambda: contact_block(pd.Ground(friction=0.5), velocity=(1.0, -1.0, 0.0), youngs=1e6, cells=4),
     "landing": lambda: landing(1e6),
     "rough landing": lambda: landing(1e5, friction=0.5),
+    "rubber": lambda: swing(5, 1e6, poisson=0.4, averaging=4),
 }
 
 
@@ -127,7 +128,7 @@ def test_iterates_are_those_of_the_cpu(name: str, outer: str) -> None:
 
 @pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("outer", SOLVERS)
-@pytest.mark.parametrize("name", ["beam", "octopus", "ground"])
+@pytest.mark.parametrize("name", ["beam", "octopus", "ground", "rubber"])
 def test_float32_comes_as_near_as_on_the_cpu(name: str, outer: str) -> None:
     """Its floor is that of the scene: 4e-4 on the octopus, whose stiffness is random over two decades."""
     case = CASES[name]()
@@ -167,7 +168,9 @@ def test_material_that_it_was_not_made_for(outer: str) -> None:
 
 @pytest.mark.usefixtures("most_direct")
 @pytest.mark.parametrize("outer", SOLVERS)
-@pytest.mark.parametrize("name", ["slivers", "beam", "ground", "sphere", "sliding", "landing", "rough landing"])
+@pytest.mark.parametrize(
+    "name", ["slivers", "beam", "ground", "sphere", "sliding", "landing", "rough landing", "rubber"]
+)
 def test_an_environment_does_not_know_of_the_others(name: str, outer: str, dtype: torch.dtype) -> None:
     """Alone by many blocks, in a batch by fewer, and among more than run at once."""
     case = CASES[name]()
@@ -314,7 +317,7 @@ def test_gradients_are_those_of_the_cpu() -> None:
 
 
 @pytest.mark.usefixtures("most_direct")
-@pytest.mark.parametrize("name", ["sliding", "box"])
+@pytest.mark.parametrize("name", ["sliding", "box", "rubber"])
 def test_gradients_of_any_solver_may_have_the_preconditioner(name: str) -> None:
     """Those of the CPU without it; the same bits alone and in a batch; the step's bits stay."""
     case = CASES[name]()

@@ -21,10 +21,10 @@ SOLVERS = [pd.Multilevel("lbfgs"), pd.Multilevel("momentum"), pd.Multilevel()]
 IDS = ["lbfgs", "momentum", "corotated"]
 
 
-def swing(cells: int, youngs: float) -> Case:
+def swing(cells: int, youngs: float, **material: Any) -> Case:
     """The box of 5r x r x r cells that swings about its held end."""
     vertices, tets = box((1.0, 0.2, 0.2), (5 * cells, cells, cells))
-    body = pd.Solid(pd.TetMesh(vertices, tets), youngs=youngs, density=1000.0)
+    body = pd.Solid(pd.TetMesh(vertices, tets), youngs=youngs, density=1000.0, **material)
     velocities = np.zeros_like(vertices)
     velocities[:, 1] = -10.0 * vertices[:, 0] ** 2
     scene = pd.Scene(body, pd.Pin(body, vertices[:, 0] == 0.0), pd.Gravity((0.0, -9.8, 0.0)))

@@ -256,6 +256,7 @@ class CorotationMaker {
     for (int k = 0; k < turning_groups; ++k)
       tile.set(place, k, TurningGradient<T>(inverse, back, x, weight[k]));
     tile.weight(place) = select(there, numbers.weight, T(0));
+    if constexpr (has_poisson_ratio) tile.pressure(place) = select(there, numbers.pressure, T(0));
   }
 
   // Called by a warp, which processes every `Slices`-th group of 32 tetrahedra.
@@ -273,8 +274,10 @@ class CorotationMaker {
         T row[6];
 #pragma unroll
         for (int c = 0; c < 6; ++c) row[c] = w * own.h[i][c];
+        if constexpr (has_poisson_ratio) add_dilation(own.h[i], tile.pressure(e), row);
 #pragma unroll
-        for (int j = 0; j < 6; ++j) add_strain_product(row, i, other.h[j], j, part[6 * i + j]);
+        for (int j = 0; j < 6; ++j)
+          add_strain_product<has_poisson_ratio>(row, i, other.h[j], j, part[6 * i + j]);
       }
     }
     spread_sums(part);

@@ -3,6 +3,7 @@
 #pragma once
 #include "cuda/common/memory.h"
 #include "cuda/common/reductions.h"
+#include "cuda/elements/group_lanes.h"
 #include "solver/multilevel/deflation.h"
 #include "views/shared_memory.h"
 
@@ -42,12 +43,13 @@ struct KeptSums {
   }
 };
 
-// Data of a tetrahedron for strain products: g and p of each group, and w V. Neighbouring
+// Data of a tetrahedron for strain products: g and p of each group, w V, and V lambda with Poisson's ratio. Neighbouring
 // tetrahedra are adjacent in memory.
 template <class T>
 class TurningTile {
-  static constexpr int of_group = 12, numbers = turning_groups * of_group + 1;
-  static_assert(numbers == turning_tile_numbers);
+  static constexpr int of_group = 12, of_groups = turning_groups * of_group;
+  static constexpr int numbers = of_groups + (has_poisson_ratio ? 2 : 1);
+  static_assert(of_groups + 1 == turning_tile_numbers);
 
  public:
   PD_DEVICE TurningTile(std::byte* shared, std::size_t bytes)
@@ -68,7 +70,8 @@ class TurningTile {
     };
     return TurningStrain<T>(TurningGradient<T>(row(0), {{row(3), row(6), row(9)}}));
   }
-  PD_DEVICE T& weight(int e) const { return memory_[(numbers - 1) * size_ + e]; }
+  PD_DEVICE T& weight(int e) const { return memory_[of_groups * size_ + e]; }
+  PD_DEVICE T& pressure(int e) const { return memory_[(of_groups + 1) * size_ + e]; }
 
  private:
   PD_DEVICE T& at(int e, int group, int n) const {
