@@ -70,7 +70,7 @@ struct KindShape {
   bool of_tets;  // whether it reads the material of tetrahedra
   std::vector<std::string> rows;
   const char* meaning;
-  bool on_gpu;    // whether a GPU has kernels for it
+  bool large;     // see elements/stencil.h
   int quadratic;  // arrays that make its energy quadratic; 0: none do
 };
 
@@ -85,7 +85,7 @@ std::vector<KindShape> kind_shapes() {
                    pd::reads_tets<pd::type>, \
                    {},                       \
                    what,                     \
-                   pd::runs_on_gpu<pd::type>,  \
+                   pd::is_large<pd::type>,   \
                    pd::quadratic_arrays<pd::type>});
 #define PARAMETER(name, array) kinds.back().rows.push_back(#array);
 #include "elements/kinds.def"
@@ -149,6 +149,7 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std
           measure.data(),
           constant.data(),
           row ? row->data() : nullptr,
+          shape.large,
           quadratic};
 }
 
@@ -380,8 +381,7 @@ py::list kind_table() {
   py::list rows;
   for (const KindShape& kind : kind_shapes())
     rows.append(py::make_tuple(kind.name, kind.corners, kind.dims, kind.constants,
-                               py::tuple(py::cast(kind.rows)), kind.meaning, kind.on_gpu,
-                               kind.quadratic));
+                               py::tuple(py::cast(kind.rows)), kind.meaning, kind.quadratic));
   return rows;
 }
 
@@ -436,7 +436,7 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes,
                         bool own_effects) {
   const bool levels = level_sizes.size() > 0, stencils = stencil_sizes.size() > 0;
   if (sizes.size() != pd::size_count || (levels && level_sizes.size() != pd::level_size_count) ||
-      (stencils && (stencil_sizes.size() < pd::stencil_size_count ||
+      (stencils && (stencil_sizes.size() != pd::stencil_size_count + int(pd::KindNumber::count) ||
                     row_sizes.size() != pd::row_size_count)))
     throw py::value_error(
         "sizes, level_sizes, stencil_sizes and row_sizes must be those of a plan for a GPU");
@@ -448,7 +448,9 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes,
   step.material.planes_count = planes;
   step.material.spheres_count = spheres;
   step.material.stiffness.stride = own_stiffness ? step.plan.tets : 0;
-  if (stencils) step.stencils.count(stencil_sizes.data(), row_sizes.data());
+  if (stencils)
+    step.stencils = pd::count_device_stencils<T>(stencil_sizes.data(), row_sizes.data());
+  step.effects.stiffness = step.material.stiffness;
   // whichever of them it is
   step.effects.bending.stride = own_effects ? 1 : 0;
   return bytes_of(step);
@@ -499,7 +501,7 @@ PYBIND11_MODULE(_C, m) {
       "stencil_table", [] { return table(stencil_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays of stencils, in op order.");
   m.def("kind_table", &kind_table,
-        "Rows (name, corners, dims, constants, arrays, meaning, on_gpu, quadratic) of the kinds of "
+        "Rows (name, corners, dims, constants, arrays, meaning, quadratic) of the kinds of "
         "stencils.");
   m.def(
       "multilevel_table", [] { return table(multilevel_rows); },

@@ -102,12 +102,8 @@ void view_stencils(Plan<T>& plan, at::TensorList arrays, int first, const Place&
   const int32* size = arrays[first].const_data_ptr<int32>();
   plan.stencil_blocks = size[stencil_blocks];
   plan.stencil_numbers = size[stencil_number_rows];
-  for (int kind = 0; kind < int(KindNumber::count); ++kind) {
-    with_kind(kind, [&](auto type) {
-      if (memory_of<decltype(type)> > 0 && size[stencil_size_count + kind] > 0)
-        plan.remembers = true;
-    });
-  }
+  plan.remembers =
+      any_kind(size + stencil_size_count, [](auto kind) { return memory_of<decltype(kind)> > 0; });
   int at = first;
   using real = T;
 #define X(name, type, width, rows, meaning)                                                     \
@@ -284,13 +280,13 @@ inline void count_rows(StencilRows& count, const Tensor& sizes, int patches) {
 // The arrays of the stencils, without any if the plan has none.
 template <class T>
 DeviceStencils<T> device_stencils_view(at::TensorList arrays, int patches, const Place& place) {
-  DeviceStencils<T> stencils;
-  if (!has_device_stencils(arrays)) return stencils;
+  if (!has_device_stencils(arrays)) return {};
   const Tensor& row_sizes = arrays[device_plan_arrays + row_sizes_array];
   StencilRows count = count_stencils(arrays[device_plan_arrays], patches);
   count_rows(count, row_sizes, patches);
-  stencils.count(arrays[device_plan_arrays].const_data_ptr<int32>(),
-                 row_sizes.const_data_ptr<int32>());
+  DeviceStencils<T> stencils =
+      count_device_stencils<T>(arrays[device_plan_arrays].const_data_ptr<int32>(),
+                               row_sizes.const_data_ptr<int32>());
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = device_plan_arrays;
   using real = T;
@@ -492,9 +488,13 @@ inline std::int64_t rows_of(const Tensor& t, int width, const char* name) {
 
 // Whether some stencils of a plan read an array of the material.
 inline bool stencils_read(at::TensorList plan, std::string_view name) {
-  const int others = int(plan.size()) - plan_arrays;
-  if (others != stencil_arrays && others != stencil_arrays + level_arrays) return false;
-  const Tensor& sizes = plan[plan_arrays];
+  const auto has_sizes = [&](int arrays, int of_stencils) {
+    const int others = int(plan.size()) - arrays;
+    return others == of_stencils || others == of_stencils + level_arrays;
+  };
+  const int at = has_sizes(plan_arrays, stencil_arrays) ? plan_arrays : device_plan_arrays;
+  if (at != plan_arrays && !has_sizes(at, device_stencil_arrays)) return false;
+  const Tensor& sizes = plan[at];
   constexpr int count = stencil_size_count + int(KindNumber::count);
   if (!sizes.is_cpu() || sizes.numel() != count) return false;
   const int32* const size = sizes.const_data_ptr<int32>() + stencil_size_count;

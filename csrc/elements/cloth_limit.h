@@ -10,6 +10,7 @@ namespace pd::inline PD_TARGET {
 struct ClothLimit {
   static constexpr int corners = 3, dims = 2, constants = 0, rows = 3;
   static constexpr int numbers = 3;  // k V, lo, hi
+  static constexpr bool large = true;
 
   template <class R>
   PD_HD static void parameters(const R (&row)[3], const R& measure, R (&p)[3]) {

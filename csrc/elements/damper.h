@@ -15,7 +15,7 @@ struct Damper {
   static constexpr int corners = 4, dims = 3, constants = 0, rows = 3;
   static constexpr int memory = 6,
                        numbers = 1 + memory;  // 2 mu beta V / h; U_t: xx, yy, zz, xy, xz, yz
-  static constexpr bool dissipates = true;
+  static constexpr bool dissipates = true, large = true;
 
   template <class R>
   PD_HD static Mat3<R> matrix(const R* m) {

@@ -123,10 +123,27 @@ struct ArraysOf {
 template <class Kind>
 constexpr bool reads_tets = ArraysOf<Kind>().of_tets;
 
-// Whether a GPU has kernels for a kind: none that depends on the start of a step or reads arrays of tetrahedra, yet.
-template <class Kind>
-constexpr bool runs_on_gpu = memory_of<Kind> == 0 && !reads_tets<Kind> &&
-                             ArraysOf<Kind>().first[array_count<Kind>] == array_count<Kind>;
+// Whether holds(kind) for a kind of which a plan has stencils. `counts`: of each kind.
+template <class Holds>
+bool any_kind(const int32* counts, const Holds& holds) {
+  bool found = false;
+  for (int number = 0; number < int(KindNumber::count); ++number)
+    with_kind(number, [&](auto kind) { found = found || (counts[number] > 0 && holds(kind)); });
+  return found;
+}
+
+// The counts of a plan's stencils and of their rows, from their arrays of sizes; without the other arrays.
+template <class T>
+DeviceStencils<T> count_device_stencils(const int32* sizes, const int32* row_sizes) {
+  DeviceStencils<T> stencils;
+  const int32* const counts = sizes + stencil_size_count;
+  stencils.blocks = sizes[stencil_blocks];
+  stencils.number_rows = sizes[stencil_number_rows];
+  for (int i = 0; i < row_size_count; ++i) stencils.rows[i] = row_sizes[i];
+  stencils.remembers = any_kind(counts, [](auto kind) { return memory_of<decltype(kind)> > 0; });
+  stencils.reads_tets = any_kind(counts, [](auto kind) { return reads_tets<decltype(kind)>; });
+  return stencils;
+}
 
 // The rows of those arrays in one environment. An array that the scene lacks has zeros.
 template <class Kind, class T>

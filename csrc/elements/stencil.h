@@ -23,6 +23,8 @@
 //   memory_slope(f, df, p, c, s) derivative of V P : dF by them
 //   begin_slope(f, s, P)         s times the derivative of m by F at the start
 //   dissipates                   true: psi is an energy times time, which a step divides by h; no elastic energy
+// and
+//   large                        true: it takes many registers. On a GPU only the kernels of cuda/poisson have it
 #pragma once
 #include "math/dual.h"
 #include "math/vec.h"
@@ -58,6 +60,12 @@ constexpr bool dissipates = false;
 template <class Kind>
   requires requires { Kind::dissipates; }
 constexpr bool dissipates<Kind> = Kind::dissipates;
+
+template <class Kind>
+constexpr bool is_large = false;
+template <class Kind>
+  requires requires { Kind::large; }
+constexpr bool is_large<Kind> = Kind::large;
 
 // The stiffness at rest, which preconditioners are made of.
 template <class Kind, class R>

@@ -30,6 +30,7 @@ PD_HD R off_zero(const R& a) {
 template <class Law, int Numbers>
 struct StretchLaw {
   static constexpr int corners = 4, dims = 3, constants = 0;
+  static constexpr bool large = true;
   static constexpr int numbers = Numbers;  // w V, then those of the set
 
   template <bool Energy, class R>

@@ -146,17 +146,14 @@ struct DeviceStencils {
 #undef X
   const int32* stencil_end = nullptr;  // [patches] end of the blocks of stencils that are elements
   int blocks = 0, number_rows = 0;     // blocks of 32 stencils; rows of 32 numbers of a step
+  bool remembers = false;              // some stencils have numbers of the start of a step
+  bool reads_tets = false;             // some read the material of tetrahedra
   int rows[row_size_count] = {};
 
   PD_HD bool has_rows() const { return rows[row_blocks] > 0; }
   // numbers of the rows: t of all neighbours, and two diagonals
   PD_HD std::int64_t numbers_of_rows() const {
     return 64 * (std::int64_t(rows[row_lines]) + rows[row_blocks]);
-  }
-  void count(const int32* stencil_sizes, const int32* row_sizes) {
-    blocks = stencil_sizes[stencil_blocks];
-    number_rows = stencil_sizes[stencil_number_rows];
-    for (int i = 0; i < row_size_count; ++i) rows[i] = row_sizes[i];
   }
 };
 
@@ -343,6 +340,11 @@ enum class Field : int {
   damping_start,  // derivative of gradient times direction by the positions at the start of the step
   damping_products
 };
+
+inline bool is_of_damping(Field field) {
+  return field == Field::damping_gradient || field == Field::damping_product ||
+         field == Field::damping_start || field == Field::damping_products;
+}
 
 template <class T, class P = Plan<T>>
 struct FieldCall : P::EffectViews {

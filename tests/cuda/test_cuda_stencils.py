@@ -21,7 +21,7 @@ from torchpd.plan.placement import step_bytes
 require_gpu()
 
 KERNELS = ("block", "stream")
-EFFECTS = {row.name for row in EFFECT_ROWS}
+EFFECTS = {row.name: row for row in EFFECT_ROWS}
 pytestmark = [
     pytest.mark.usefixtures("poisoned"),
     # they start a little inside a ground and a ball, so that contacts act
@@ -54,9 +54,15 @@ def different(sim: pd.Simulator, name: str, batch: int) -> tuple[pd.State, Tenso
 
 def own_rows(sim: pd.Simulator, batch: int) -> dict[str, Tensor]:
     """The effects of a scene, other ones in every environment."""
-    shades = torch.linspace(0.8, 1.25, batch, dtype=torch.float64)[:, None]
-    names = [name for name in sim.material_names if name in EFFECTS]
-    return {name: (shades * getattr(sim, name).detach().double().cpu()).to(sim.dtype) for name in names}
+    shades = torch.linspace(0.8, 1.25, batch, dtype=torch.float64)
+    found = {}
+    for name in (name for name in sim.material_names if name in EFFECTS):
+        row = getattr(sim, name).detach().double().cpu()
+        found[name] = row.repeat(batch, *[1] * row.dim())
+        # of limits the stiffness, which is the last number
+        scaled = found[name][..., -1:] if EFFECTS[name].width > 1 else found[name]
+        scaled *= shades.reshape(-1, *[1] * row.dim())
+    return {name: row.to(sim.dtype) for name, row in found.items()}
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 9, 40])
@@ -94,7 +100,7 @@ def test_environments_have_rows_of_their_own(name: str, kernel: str, precision: 
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
 @pytest.mark.parametrize("own", [False, True], ids=["shared", "own rows"])
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("name", ["sheet", "mixed", "mixed, poisson"])
+@pytest.mark.parametrize("name", ["sheet", "mixed", "mixed, poisson", "mixed, all"])
 def test_runs_and_batches_do_not_matter(name: str, kernel: str, own: bool, tolerance: float, precision: str) -> None:
     batch = 700
     case, dtype = CASES[name](), DTYPES[precision]
@@ -119,9 +125,10 @@ def test_runs_and_batches_do_not_matter(name: str, kernel: str, own: bool, toler
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_rollout_is_its_steps(kernel: str, precision: str) -> None:
-    sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=10)
-    state, forces = different(sim, "mixed", 5)
+@pytest.mark.parametrize("name", ["mixed", "mixed, all"])
+def test_a_rollout_is_its_steps(name: str, kernel: str, precision: str) -> None:
+    sim = on_gpu(CASES[name](), DTYPES[precision], kernel, iterations=10)
+    state, forces = different(sim, name, 5)
     state, forces = moved(state, GPU), forces.to(GPU)
     track = sim.rollout(state, 3, forces=forces)
     for step in range(3):
@@ -131,9 +138,10 @@ def test_a_rollout_is_its_steps(kernel: str, precision: str) -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_replay_is_a_step_in_place(kernel: str, precision: str) -> None:
-    sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=10)
-    start, forces = different(sim, "mixed", 3)
+@pytest.mark.parametrize("name", ["mixed", "mixed, all"])
+def test_a_replay_is_a_step_in_place(name: str, kernel: str, precision: str) -> None:
+    sim = on_gpu(CASES[name](), DTYPES[precision], kernel, iterations=10)
+    start, forces = different(sim, name, 3)
     own, eager = (moved(start, GPU) for _ in range(2))
     eager = pd.State(*(t.clone() for t in eager))
     forces = forces.to(GPU)
@@ -147,9 +155,10 @@ def test_a_replay_is_a_step_in_place(kernel: str, precision: str) -> None:
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_the_host_never_waits(kernel: str, precision: str) -> None:
-    sim = on_gpu(mixed_case(), DTYPES[precision], kernel, iterations=10)
-    state, _ = different(sim, "mixed", 3)
+@pytest.mark.parametrize("name", ["mixed", "mixed, all"])
+def test_the_host_never_waits(name: str, kernel: str, precision: str) -> None:
+    sim = on_gpu(CASES[name](), DTYPES[precision], kernel, iterations=10)
+    state, _ = different(sim, name, 3)
     state = moved(state, GPU)
     sim(state)
     assert not host_waits(lambda: sim(state))
@@ -159,6 +168,7 @@ def ops_of(sim: pd.Simulator, state: pd.State, along: Tensor) -> dict[str, list[
     """All fields of the elastic energy."""
     ops, material, plan = torch.ops.torchpd, [t.detach() for t in sim.material()], list(sim.plan.arrays)
     x, d = state.positions, along
+    start, h = x - 0.2 * d, sim.time_step
     moduli = [ops.lame_product(x, way, material, plan) for way in (d, None) if "poisson" in sim.material_names]
     return {
         "moduli": moduli,
@@ -170,7 +180,10 @@ def ops_of(sim: pd.Simulator, state: pd.State, along: Tensor) -> dict[str, list[
         "energy": [ops.effect_energy(x, material, plan)],
         "products": list(ops.effect_products(x, d, material, plan)),
         "derivatives": list(ops.effect_products(x, None, material, plan)),
-        "at rest": [ops.stiffness_at_rest(material, plan)],
+        "at rest": [ops.stiffness_at_rest(material, plan), ops.stiffness_at_rest(material, plan, time_step=h)],
+        "damped diagonal": [ops.elastic_diagonal(material, plan, weighted=True, time_step=h)],
+        "damping": [ops.damping_gradient(x, start, material, plan, time_step=h)],
+        "derivatives of damping": list(ops.damping_vjp(x, start, d, material, plan, time_step=h)),
     }
 
 
@@ -215,7 +228,7 @@ def test_gradients_of_every_row_are_those_of_the_cpu(name: str, kernel: str, own
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("name", ["sheet", "springs, poisson"])
+@pytest.mark.parametrize("name", ["sheet", "springs, poisson", "damped"])
 def test_gradients_do_not_feel_their_batch(name: str, kernel: str, precision: str) -> None:
     sim = on_gpu(CASES[name](), DTYPES[precision], kernel, iterations=200)
     state, forces = different(sim, name, 40)
@@ -235,7 +248,7 @@ def test_gradients_do_not_feel_their_batch(name: str, kernel: str, precision: st
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("name", ["mixed", "mixed, poisson"])
+@pytest.mark.parametrize("name", ["mixed", "mixed, poisson", "limited sheet", "mixed, all"])
 def test_a_step_takes_what_it_is_said_to(name: str, kernel: str, precision: str) -> None:
     sim = on_gpu(CASES[name](), DTYPES[precision], kernel, iterations=2)
 

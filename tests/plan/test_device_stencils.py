@@ -38,6 +38,7 @@ class Stencils:
         corners, stored = group.corners.shape[1], self.numbers(group) + group.constants.shape[1]
         self.patch = np.repeat(np.searchsorted(plan.patch_stencil, blocks, side="right") - 1, LANES)
         self.order = plan.stencil_order[blocks].reshape(-1)
+        self.row = plan.stencil_row[blocks].reshape(-1)
         self.measure = plan.stencil_measure[blocks].reshape(-1)
         self.bound = plan.stencil_bound[blocks].reshape(-1)
 
@@ -85,6 +86,8 @@ def test_every_stencil_is_there_once_with_its_corners(built: tuple[Case, Arrays]
         # padding repeats a stencil of its block, without measure or entries
         assert (lanes.entry[~lanes.live] == NONE).all()
         assert (lanes.vertex == group.corners[lanes.order]).all()
+        rows = np.arange(len(group)) if group.tets is None else group.tets
+        np.testing.assert_array_equal(lanes.row, rows[lanes.order])
 
 
 def test_stored_numbers_are_the_vectors_but_for_a_turn(built: tuple[Case, Arrays]) -> None:
@@ -134,7 +137,8 @@ def test_blocks_of_a_patch_stand_kind_by_kind(built: tuple[Case, Arrays]) -> Non
         for part in (slice(begin, middle), slice(middle, end)):
             assert (np.diff(plan.stencil_block[part, 0]) >= 0).all()
     kinds = list(KINDS.values())
-    for column, count in ((1, lambda kind: kind.corners), (3, lambda kind: 2)):
+    numbers = {"solid_limit": 3, "cloth_limit": 3, "volume": 1, "damper": 7}  # others have two
+    for column, count in ((1, lambda kind: kind.corners), (3, lambda kind: numbers.get(kind.name, 2))):
         rows = np.array([count(kinds[kind]) for kind in plan.stencil_block[:, 0]])
         np.testing.assert_array_equal(plan.stencil_block[:, column], np.cumsum(rows) - rows)
 
@@ -153,7 +157,7 @@ def test_widths_and_types_follow_the_table() -> None:
     tensors = compile_device_plan(values, 3, STREAM, torch.float32)
     for row, array in zip(device_table(values), tensors, strict=True):
         assert array.dtype == {"int32": torch.int32, "real": torch.float32, "int16": torch.int16}[row.type]
-    assert [len(tensors), len(DEVICE_STENCIL_TABLE)] == [len(DEVICE_PLAN_TABLE) + 19, 19]
+    assert [len(tensors), len(DEVICE_STENCIL_TABLE)] == [len(DEVICE_PLAN_TABLE) + 20, 20]
     assert not has_preconditioner(tensors)
     assert has_preconditioner(tensors[: len(DEVICE_PLAN_TABLE)] + tuple(MULTILEVEL_TABLE))
 

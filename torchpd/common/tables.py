@@ -61,7 +61,6 @@ class Kind(NamedTuple):
     constants: int  # further constants of a stencil
     rows: tuple[str, ...]  # names of its arrays in the material
     meaning: str
-    on_gpu: bool  # whether a GPU has kernels for it
     quadratic: int  # its first arrays that make a quadratic energy where a scene lacks the others; 0: none do
 
     @property

@@ -14,7 +14,7 @@ from torch import Tensor
 from .. import _C
 from ..common.checks import plain_tensor
 from ..common.gpu import check_free_memory, free_memory, properties_of, unavailable_reason, visible_devices
-from ..common.tables import EFFECT_ROWS, KINDS
+from ..common.tables import EFFECT_ROWS
 from ..ops.diagonal import pinned_vertices
 from ..scene.solvers import Multilevel
 from .compiled import CompiledScene
@@ -102,12 +102,6 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=compiled.progress)
-    lacking = [group.kind for group in values.stencils if not KINDS[group.kind].on_gpu]
-    if lacking:
-        raise RuntimeError(
-            "Simulator: device must be the CPU for scenes with strain limits, the volume law or stiffness-proportional "
-            f"damping ({', '.join(lacking)}), which have no kernels for {device}; keep it there, or leave these out"
-        )
     return choose_plan(
         values, dtype, properties_of(device), compiled.kernel,
         levels=isinstance(compiled.solver, Multilevel), batch=compiled.batch, progress=compiled.progress,

@@ -40,7 +40,7 @@ struct Cuda {
     return call.stencils.blocks > 0 ? call.stencils.stencil_sizes + stencil_size_count : nullptr;
   }
 
-  // With Poisson's ratio where the kernels for it read it.
+  // With Poisson's ratio, which the kernels of cuda/poisson read beside the tetrahedra.
   template <class Call>
   static Mixed<Call> with_poisson(const Mixed<Call>& call) {
     Mixed<Call> own = call;
@@ -48,11 +48,11 @@ struct Cuda {
     return own;
   }
   template <class Call>
-  static bool has_poisson(const Mixed<Call>& call) {
+  static bool runs_with_poisson(const Mixed<Call>& call) {
     TORCH_CHECK_VALUE(!call.effects.poisson.data || call.plan.members > 0,
                       "plan must have groups of tetrahedra for a material with Poisson's ratio; "
                       "compile the scene again");
-    return call.effects.poisson.data != nullptr;
+    return call.plan.members > 0;
   }
   template <class Call>
   static bool is_mixed(const Mixed<Call>& call) {
@@ -77,7 +77,7 @@ struct Cuda {
   static void step(const Step<T>& call, const Tensor& like) {
     check_rows<T>(call);
     const bool stream = call.plan.kernel == int(DeviceKernel::stream);
-    if (has_poisson(call)) {
+    if (runs_with_poisson(call)) {
       const Step<T> own = with_poisson(call);
       is_mixed(own) ? run(like, own, poisson::mixed_step_bytes<T>,
                           stream ? poisson::run_mixed_stream<T> : poisson::run_mixed_block<T>)
@@ -93,10 +93,11 @@ struct Cuda {
   template <class T>
   static void field(const Field<T>& call, const Tensor& like) {
     // what belongs to effects is zero
-    const bool of_effects =
-        call.field == pd::Field::effect_energy || call.field == pd::Field::effect_products;
-    if (of_effects && !is_mixed(call)) return;
-    if (has_poisson(call)) {
+    const bool of_effects = call.field == pd::Field::effect_energy ||
+                            call.field == pd::Field::effect_products || is_of_damping(call.field);
+    if (of_effects && !is_mixed(call)) return void(like.zero_());
+    if (is_of_damping(call.field) && !runs_with_poisson(call)) return void(like.zero_());
+    if (runs_with_poisson(call)) {
       const Field<T> own = with_poisson(call);
       is_mixed(own)
           ? run(like, own, poisson::mixed_field_bytes<T>, poisson::run_mixed_field<T>)
@@ -120,7 +121,7 @@ struct Cuda {
 
   template <class T>
   static void conjugate(const Conjugate<T>& call, const Tensor& like) {
-    if (has_poisson(call)) {
+    if (runs_with_poisson(call)) {
       const Conjugate<T> own = with_poisson(call);
       is_mixed(own)
           ? run(like, own, poisson::mixed_conjugate_bytes<T>, poisson::run_mixed_conjugate<T>)

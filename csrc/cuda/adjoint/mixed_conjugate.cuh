@@ -42,7 +42,14 @@ ConjugateLaunch<T> mixed_launch(const MixedConjugate<T>& call) {
 
 template <class T>
 StencilWork<T> arrange_stencils(Arena& arena, const MixedConjugate<T>& call) {
-  return arrange_stencils(arena, call.stencils, call.effects, call.batch);
+  return arrange_stencils(arena, call.stencils, call.effects, call.batch, call.per_time);
+}
+
+template <class T>
+void compute_numbers(const StencilWork<T>& work, const MixedConjugate<T>& call,
+                     cudaStream_t stream) {
+  compute_stencil_numbers(work, call.effects, call.batch, stream);
+  begin_stencils(work, call.plan, call.start, call.batch, stream);
 }
 
 template <class T>
@@ -67,7 +74,7 @@ void run_mixed_conjugate(const MixedConjugate<T>& call, void* memory, Stream to)
     MixedConjugateBlock<T> work;
     static_cast<ConjugateBlock<T>&>(work) = arrange_block(arena, solid);
     work.stencils = arrange_stencils(arena, call);
-    compute_stencil_numbers(work.stencils, call.effects, call.batch, stream);
+    compute_numbers(work.stencils, call, stream);
     compute_field_weights<false, T>(work.product, stream);
     launch_block(work, items_of_patch(call), stream);
     return;
@@ -76,7 +83,7 @@ void run_mixed_conjugate(const MixedConjugate<T>& call, void* memory, Stream to)
   MixedConjugateTeams<T> work;
   static_cast<ConjugateTeams<T>&>(work) = arrange_teams(arena, solid, launch);
   work.stencils = arrange_stencils(arena, call);
-  compute_stencil_numbers(work.stencils, call.effects, call.batch, stream);
+  compute_numbers(work.stencils, call, stream);
   compute_field_weights<true, T>(work.product, stream);
   launch_solve(launch, work, stream);
 }

@@ -51,15 +51,19 @@ __global__ void __launch_bounds__(field_threads)
   if (threadIdx.x == 0) work.field.out[blockIdx.x] = T(sum[0]);
 }
 
-// Derivatives of a stencil by the rows of its material. `Product`: of the product with the direction, else the energy.
+// Adds the derivatives of a stencil by the rows of its material. `Product`: of the product with the direction, else the
+// energy.
 template <class Kind, bool Product, int Fields, class T>
 __device__ void write_products(const MixedFieldWork<T>& work, const PatchFields<Fields, T>& fields,
                                const StencilPlace<T>& place) {
   constexpr ArraysOf<Kind> arrays;
   const DeviceStencils<T>& plan = work.stencils.plan;
-  const T measure = plan.stencil_measure[place.stencil()];
+  T measure = plan.stencil_measure[place.stencil()];
   if (measure == T(0)) return;  // padding
-  const int number = plan.stencil_order[place.stencil()];
+  if (dissipates<Kind>) measure = measure * work.stencils.per_time;
+  const std::int64_t number = plan.stencil_row[place.stencil()];
+  const std::int64_t count =
+      reads_tets<Kind> ? work.field.plan.tets : work.counts[kind_number<Kind>];
   const MaterialRows<Kind, T> rows(work.effects.effects, fields.environment);
   T g[gradient_numbers<Kind>], c[constant_slots<Kind>] = {}, row[Kind::rows] = {};
   for (int i = 0; i < gradient_numbers<Kind>; ++i) g[i] = place.stored(i);
@@ -73,16 +77,25 @@ __device__ void write_products(const MixedFieldWork<T>& work, const PatchFields<
     for (int a = 0; a < Kind::corners; ++a) x[a] = vectors[a][1];
     deform<Kind>(x, g, df);
   }
-  for (int i = 0; i < Kind::rows; ++i) {
-    T* const out = work.effects.products[arrays.effect[i]];
+  T memory[memory_of<Kind> + 1];
+  const T* const numbers = work.stencils.numbers_of(fields.environment);
+  for (int i = 0; i < memory_of<Kind>; ++i)
+    memory[i] = numbers[place.number_of_step(Kind::numbers - memory_of<Kind> + i)];
+#pragma unroll 1
+  for (int a = 0; a < arrays.count; ++a) {
+    T* out = work.effects.products[arrays.effect[a]];
     if (!out) continue;
-    const RowDerivative<Kind, T> by(i, row, measure, f, df, c);
-    out[fields.environment * work.counts[kind_number<Kind>] + number] =
-        Product ? by.product : by.energy;
+    const int width = arrays.width(a);
+    out += (fields.environment * count + number) * width;
+    for (int i = 0; i < width; ++i) {
+      const RowDerivative<Kind, T> by(arrays.first[a] + i, row, measure, f, df, c, memory);
+      out[i] = out[i] + (Product ? by.product : by.energy);
+    }
   }
 }
 
-template <bool Product, class T>
+// `Kinds`: has(kind) of those whose turn it is.
+template <class Kinds, bool Product, class T>
 __global__ void __launch_bounds__(field_threads)
     stencil_products(const __grid_constant__ MixedFieldWork<T> work) {
   extern __shared__ __align__(16) std::byte shared[];
@@ -90,8 +103,47 @@ __global__ void __launch_bounds__(field_threads)
   const PatchFields<wanted, T> fields(work.field, shared);
   each_stencil_block(work.stencils.plan, fields.patch.index, 0,
                      [&](auto kind, const StencilPlace<T>& place) {
-                       write_products<decltype(kind), Product>(work, fields, place);
+                       using Kind = decltype(kind);
+                       if constexpr (Kinds::template has<Kind>)
+                         write_products<Kind, Product>(work, fields, place);
                      });
+}
+
+// Kinds with rows of their own; those that share the rows of tetrahedra take turns.
+struct OwnRows {
+  template <class Kind>
+  static constexpr bool has = !reads_tets<Kind>;
+};
+template <class Turn>
+struct RowsOfTets {
+  template <class Kind>
+  static constexpr bool has = std::is_same_v<Kind, Turn>;
+};
+
+// The work of `Element` on the stencils alone.
+template <class Element, int Fields, class T>
+__global__ void __launch_bounds__(field_threads)
+    stencil_vertices(const __grid_constant__ MixedFieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const PatchFields<Fields, T> fields(work.field, shared);
+  const Patch<T>& patch = fields.patch;
+  for (int s = threadIdx.x; s < patch.slots; s += blockDim.x)
+    clear_entries(fields.entries, work.field.plan.slot_row[patch.first_slot + s]);
+  __syncthreads();
+  each_stencil<Fields>(work.stencils, fields.environment, patch.index, 0, fields, fields.entries,
+                       Element{});
+  __syncthreads();
+  write_patch<3>(work, fields);
+}
+
+// Replaces the memory by the slope by it.
+template <class T>
+__global__ void __launch_bounds__(field_threads)
+    stencil_slopes(const __grid_constant__ MixedFieldWork<T> work) {
+  extern __shared__ __align__(16) std::byte shared[];
+  const PatchFields<2, T> fields(work.field, shared);
+  each_stencil<2>(work.stencils, fields.environment, fields.patch.index, 0, fields, fields.entries,
+                  StencilMemorySlope{});
 }
 
 // The stiffness at rest of tetrahedra, then of stencils kind by kind, per measure.
@@ -110,23 +162,21 @@ __global__ void __launch_bounds__(field_threads)
     const std::int64_t t = (block - plan.blocks) * stencil_lanes + thread % stencil_lanes;
     const Moduli<T> moduli(work.field.stiffness, work.field.poisson, environment);
     if (t >= tets) return;
-    if constexpr (has_poisson_ratio) {
-      out[t] = Lame<T>(moduli.youngs[t], moduli.poisson[t]).matrix();
-    } else {
-      out[t] = moduli.youngs[t];
-    }
+    out[t] = has_poisson_ratio ? moduli.lame(t).matrix() : moduli.youngs[t];
     return;
   }
   const StencilPlace<T> place(plan, int(block));
   if (plan.stencil_measure[place.stencil()] == T(0)) return;  // padding
   std::int64_t first = tets;
   for (int kind = 0; kind < place.block.kind; ++kind) first += work.counts[kind];
-  const int number = plan.stencil_order[place.stencil()];
-  with_gpu_kind(place.block.kind, [&](auto kind) {
+  const std::int64_t row = plan.stencil_row[place.stencil()];
+  T* const to = out + first + plan.stencil_order[place.stencil()];
+  with_compiled_kind(place.block.kind, [&](auto kind) {
     using Kind = decltype(kind);
     T numbers[Kind::numbers];
-    MaterialRows<Kind, T>(work.effects.effects, environment).read(number, T(1), numbers);
-    out[first + number] = rest_weight<Kind>(numbers);
+    MaterialRows<Kind, T>(work.effects.effects, environment)
+        .read(row, dissipates<Kind> ? work.stencils.per_time : T(1), numbers);
+    *to = rest_weight<Kind>(numbers);
   });
 }
 
@@ -139,7 +189,8 @@ MixedFieldWork<T> arrange_mixed(Arena& arena, const MixedField<T>& field) {
   const DeviceField<T>& call = field;
   MixedFieldWork<T> work;
   static_cast<FieldWork<T>&>(work) = arrange(arena, call, field.batch);
-  work.stencils = arrange_stencils(arena, field.stencils, field.effects, field.batch);
+  work.stencils =
+      arrange_stencils(arena, field.stencils, field.effects, field.batch, field.per_time);
   work.effects = field;
   const bool sums = field.field == Field::effect_energy;
   arena.place(work.energies, sums ? field.batch * field.plan.patches : 0);
@@ -182,6 +233,52 @@ void run_stiffness(const MixedFieldWork<T>& work, cudaStream_t stream) {
   check(cudaGetLastError());
 }
 
+// Derivatives by the rows of all kinds that dissipate, or of all others.
+template <bool Product, class T>
+void run_products(const MixedFieldWork<T>& work, bool damping, cudaStream_t stream) {
+  constexpr int wanted = Product ? 2 : 1;
+  if (!damping) launch_field(stencil_products<OwnRows, Product, T>, work, wanted, stream);
+  for (int number = 0; number < int(KindNumber::count); ++number) {
+    if (work.counts[number] == 0) continue;
+    with_kind(number, [&](auto kind) {
+      using Kind = decltype(kind);
+      if constexpr (is_compiled<Kind> && reads_tets<Kind>) {
+        if (dissipates<Kind> == damping)
+          launch_field(stencil_products<RowsOfTets<Kind>, Product, T>, work, wanted, stream);
+      }
+    });
+  }
+}
+
+template <class Element, int Fields, class T>
+void run_stencil_vertices(const MixedFieldWork<T>& work, cudaStream_t stream) {
+  launch_field(stencil_vertices<Element, Fields, T>, work, Fields, stream);
+  run_shared<3, T>(work, stream);
+}
+
+// What belongs to energies that a step dissipates.
+template <class T>
+void run_damping(const MixedFieldWork<T>& work, cudaStream_t stream) {
+  if constexpr (has_large_kinds) {
+    begin_stencils(work.stencils, work.field.plan, work.field.positions, work.field.batch, stream);
+    switch (work.field.field) {
+      case Field::damping_gradient:
+        return run_stencil_vertices<Dissipating<StencilGradient<false>>, 1>(work, stream);
+      case Field::damping_product:
+        return run_stencil_vertices<Dissipating<StencilHessian>, 2>(work, stream);
+      case Field::damping_products:
+        return run_products<true>(work, true, stream);
+      default:
+        break;
+    }
+    // by the positions at the start: first by the memory of each stencil, then by them
+    launch_field(stencil_slopes<T>, work, 2, stream);
+    MixedFieldWork<T> start = work;
+    start.field.displacement = nullptr;
+    run_stencil_vertices<StencilStartSlope, 1>(start, stream);
+  }
+}
+
 template <bool Computed, class T>
 void run_mixed_field_with(const MixedFieldWork<T>& work, cudaStream_t stream) {
   compute_field_weights<Computed, T>(work, stream);
@@ -212,9 +309,10 @@ void run_mixed_field(const MixedField<T>& field, void* memory, Stream to) {
   compute_stencil_numbers(work.stencils, field.effects, field.batch, stream);
   if (field.field == Field::effect_energy) return run_energies(work, stream);
   if (field.field == Field::effect_products) {
-    if (field.direction) return launch_field(stencil_products<true, T>, work, 2, stream);
-    return launch_field(stencil_products<false, T>, work, 1, stream);
+    return field.direction ? run_products<true>(work, false, stream)
+                           : run_products<false>(work, false, stream);
   }
+  if (is_of_damping(field.field)) return run_damping(work, stream);
   if (computes_rests(field.plan)) {
     run_mixed_field_with<true>(work, stream);
   } else {

@@ -27,7 +27,7 @@ struct TermStencil {
   PD_DEVICE T gradient(int corner) const {
     if (corner > 0) return stored(corner - 1);
     T sum = T(0);
-    with_gpu_kind(block.kind, [&](auto kind) {
+    with_compiled_kind(block.kind, [&](auto kind) {
       for (int i = 0; i < decltype(kind)::corners - 1; ++i) sum = sum + stored(i);
     });
     return -sum;

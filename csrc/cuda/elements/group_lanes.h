@@ -1,5 +1,5 @@
 // Groups of tetrahedra with Poisson's ratio on a GPU. A source that defines PD_POISSON, and a PD_TARGET of its own,
-// compiles the kernels a second time for scenes that have it.
+// compiles the kernels a second time for scenes that have it, or large kinds of stencils (elements/stencil.h).
 //
 // A group of two is a pair; one of four is two pairs in neighbouring lanes, 2k and 2k + 1. A group of three has a pair of
 // which one tetrahedron is absent. Where a pair averages with its neighbour, the weight of its first tetrahedron is
@@ -21,14 +21,18 @@ constexpr bool has_poisson_ratio = false;
 // Numbers of a pair in the weights: V 2 mu of both tetrahedra, then V lambda; w V alone without Poisson's ratio.
 constexpr unsigned pair_weights = has_poisson_ratio ? 4 : 2;
 
-// Elastic moduli of an environment; the second is null without Poisson's ratio.
+// Elastic moduli of an environment; the second is null where Poisson's ratio is zero.
 template <class T>
 struct Moduli {
   const T *youngs, *poisson;
 
   PD_HD Moduli(const Values<T>& stiffness, const Values<T>& ratio, std::int64_t environment)
       : youngs(stiffness.of(environment)),
-        poisson(has_poisson_ratio ? ratio.of(environment) : nullptr) {}
+        poisson(has_poisson_ratio && ratio.data ? ratio.of(environment) : nullptr) {}
+
+  PD_HD Lame<T> lame(std::int64_t tet) const {
+    return {youngs[tet], poisson ? poisson[tet] : T(0)};
+  }
 };
 
 // Whether environments have weights of their own.

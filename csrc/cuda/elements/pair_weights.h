@@ -14,7 +14,7 @@ PD_DEVICE void compute_group_weights(const DevicePlan<T>& plan, const Numbers& n
   const int tet = tet_of(plan, place, Side::which);
   const T volume = tet < 0 ? T(0) : numbers.template weight<Side>(T(1));
   const T bound = plan.pair_bound[at];
-  Lame<T> lame(tet < 0 ? T(0) : moduli.youngs[tet], tet < 0 ? T(0) : moduli.poisson[tet]);
+  Lame<T> lame = tet < 0 ? Lame<T>(T(0), T(0)) : moduli.lame(tet);
   if (bound < T(0) && kind != WeightKind::matrix) lame.lambda = T(0);
   const bool coupled = plan.members == 4 && Side::which == 0 &&
                        plan.pair_coupled[place.in(1)] != 0 && kind == WeightKind::force;

@@ -424,6 +424,13 @@ PD_DEVICE Vec3<T> sum_entries(const Quad<T>* entries, int row) {
   return sum;
 }
 
+template <class T>
+PD_DEVICE void clear_entries(Quad<T>* entries, int row) {
+  Quad<T>* const entry = entries + (unsigned(row) & 0xffff);
+  const int count = row >> 16 & 0x7fff;
+  for (int j = 0; j < count; ++j) entry[entry_stride * j] = quad(Vec3<T>{T(0), T(0), T(0)});
+}
+
 // The same sum where latency matters: eight loads are in flight at once.
 template <class T>
 PD_DEVICE Vec3<T> sum_entries_by_8(const Quad<T>* entries, int row) {

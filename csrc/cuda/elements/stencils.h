@@ -9,6 +9,11 @@ namespace pd::inline PD_TARGET {
 
 constexpr int stencil_lanes = 32;  // stencils per block of the plan
 
+// Large kinds would take registers from all others: only the kernels for Poisson's ratio have them.
+constexpr bool has_large_kinds = has_poisson_ratio;
+template <class Kind>
+constexpr bool is_compiled = has_large_kinds || !is_large<Kind>;
+
 // The stencils of a plan, and their numbers of a step.
 template <class T>
 struct StencilWork {
@@ -17,6 +22,7 @@ struct StencilWork {
   std::int64_t stride = 0;  // from one environment to the next
   T* rows = nullptr;        // [batch or 1, numbers_of_rows] of a step
   std::int64_t row_stride = 0;
+  T per_time = T(0);        // 1 / h, or 0 where energies that dissipate do not count
 
   PD_HD T* numbers_of(std::int64_t environment) const { return numbers + environment * stride; }
 };
@@ -59,14 +65,14 @@ template <class Kind, int Fields, class T, class Read>
 struct LaneStencil {
   using R = T;
   const StencilPlace<T>& place;
-  const T* numbers;
+  T* numbers;
   const Read& read;
   Quad<T>* entries;
   T& energy;
   unsigned word[Kind::corners];
 
-  PD_DEVICE LaneStencil(const StencilPlace<T>& at, const T* of_step, const Read& reader,
-                        Quad<T>* to, T& sum_of_energies)
+  PD_DEVICE LaneStencil(const StencilPlace<T>& at, T* of_step, const Read& reader, Quad<T>* to,
+                        T& sum_of_energies)
       : place(at), numbers(of_step), read(reader), entries(to), energy(sum_of_energies) {
     for (int c = 0; c < Kind::corners; ++c) word[c] = at.corner(c);
   }
@@ -80,6 +86,12 @@ struct LaneStencil {
   }
   PD_DEVICE T stored(int which) const { return place.stored(which); }
   PD_DEVICE T number(int which) const { return numbers[place.number_of_step(which)]; }
+  PD_DEVICE void remember(const T (&memory)[memory_of<Kind>]) const
+    requires(memory_of<Kind> > 0)
+  {
+    for (int i = 0; i < memory_of<Kind>; ++i)
+      numbers[place.number_of_step(Kind::numbers - memory_of<Kind> + i)] = memory[i];
+  }
   PD_DEVICE T bound() const { return place.plan.stencil_bound[place.stencil()]; }
   PD_DEVICE T& sum() const { return energy; }
   PD_DEVICE void add(const Vec3<T> (&force)[Kind::corners]) const {
@@ -90,12 +102,32 @@ struct LaneStencil {
   }
 };
 
-// visit(Kind{}) for the kind of a number; a plan for a GPU has no other kinds
+// visit(Kind{}) for the kind of a number; other plans run in other kernels
 template <class Visit>
-PD_DEVICE void with_gpu_kind(int number, const Visit& visit) {
+PD_DEVICE void with_compiled_kind(int number, const Visit& visit) {
   with_kind(number, [&](auto kind) {
-    if constexpr (runs_on_gpu<decltype(kind)>) visit(kind);
+    if constexpr (is_compiled<decltype(kind)>) visit(kind);
   });
+}
+
+// An operation on a stencil of a large kind, apart: the other kinds keep their registers. Returns the energy. What it
+// gets must not refer to what the caller has in registers.
+template <class Kind, int Fields, class T, class Read, class Element>
+__device__ __noinline__ T run_apart(StencilPlace<T> place, T* numbers, Read read, Quad<T>* entries,
+                                    Element element) {
+  T energy = T(0);
+  element.template run<Kind>(
+      LaneStencil<Kind, Fields, T, Read>(place, numbers, read, entries, energy));
+  return energy;
+}
+
+// The forces of a stencil that does not count. `entries` may be null.
+template <class Kind, class T>
+PD_DEVICE void add_none(const StencilPlace<T>& place, Quad<T>* entries) {
+  for (int c = 0; c < Kind::corners && entries; ++c) {
+    const unsigned entry = place.corner(c) >> 16;
+    if (entry != unsigned(no_entry)) write_entry({T(0), T(0), T(0)}, entries[entry]);
+  }
 }
 
 // Calls visit(kind, place) for every block of a patch that this warp takes. `before`: blocks that warps have taken in
@@ -115,7 +147,7 @@ PD_DEVICE void each_stencil_block(const DeviceStencils<T>& plan, int patch, int 
     // in flight while this warp works on the present one
     const StencilBlock next = StencilPlace<T>::block_of(plan, min(number + warps, end - 1));
     const StencilPlace<T> place(plan, now, number);
-    with_gpu_kind(place.block.kind, [&](auto kind) { visit(kind, place); });
+    with_compiled_kind(place.block.kind, [&](auto kind) { visit(kind, place); });
     now = next;
   }
 }
@@ -143,13 +175,28 @@ template <int Fields, class T, class Read, class Element>
 PD_DEVICE T each_stencil(const StencilWork<T>& work, std::int64_t environment, int patch,
                          int before, const Read& read, Quad<T>* entries, const Element& element) {
   T energy = T(0);
-  const T* numbers = work.numbers_of(environment);
+  T* numbers = work.numbers_of(environment);
   each_stencil_block(work.plan, patch, before, [&](auto kind, const StencilPlace<T>& place) {
     using Kind = decltype(kind);
-    element.template run<Kind>(
-        LaneStencil<Kind, Fields, T, Read>(place, numbers, read, entries, energy));
+    if constexpr (dissipates<Kind>) {
+      if (!(work.per_time > T(0))) return add_none<Kind>(place, entries);
+    }
+    if constexpr (is_large<Kind>) {
+      energy += run_apart<Kind, Fields>(place, numbers, read, entries, element);
+    } else {
+      element.template run<Kind>(
+          LaneStencil<Kind, Fields, T, Read>(place, numbers, read, entries, energy));
+    }
   });
   return energy;
+}
+
+// Makes the memory of the stencils of a patch. `read` gives the positions at the start of the step.
+template <class T, class Read>
+PD_DEVICE void begin_stencils(const StencilWork<T>& work, std::int64_t environment, int patch,
+                              int before, const Read& read) {
+  each_stencil<1>(work, environment, patch, before, read, static_cast<Quad<T>*>(nullptr),
+                  StencilBegin{});
 }
 
 // The operation on stencils that belongs to one on tetrahedra. `bounded`: weights have l_e.

@@ -55,7 +55,8 @@ MixedFusedCall<T> arrange_mixed(Arena& arena, const MixedStep<T>& step,
   const DeviceStep<T>& call = step;
   const FusedScratch<T> scratch = arrange(arena, call, launch);
   return {{call, scratch, launch.teams, launch.kept},
-          arrange_step_stencils(arena, step.stencils, step.effects, step.batch)};
+          arrange_step_stencils(arena, step.stencils, step.effects, step.batch,
+                                T(1 / step.settings.time_step))};
 }
 
 template <class T>

@@ -112,6 +112,7 @@ class FusedRunner {
       v_.predict(s, in_, patch_.vertex(s), h_);
       origin_[s] = quad(vec3(v_.x[s]) - anchor);
     });
+    if constexpr (HasStencils && has_large_kinds) begin_stencils();
   }
 
   PD_DEVICE void start() {
@@ -208,6 +209,16 @@ class FusedRunner {
   }
 
  private:
+  // Makes what stencils remember of the start of the step.
+  PD_DEVICE void begin_stencils() {
+    if (!stencils_.work.plan.remembers) return;
+    __syncthreads();
+    const int before = (patch_.pairs + pair_lanes - 1) / pair_lanes;
+    pd::begin_stencils(stencils_.work, in_.environment, patch_.index, before,
+                       [from = origin_](unsigned corner, Vec3<T>(&x)[1]) { x[0] = at_corner(from, corner); });
+    __syncthreads();
+  }
+
   // Offsets of this team's memory are computed on demand, which leaves the registers to the
   // elements.
   PD_DEVICE std::int64_t first_slot() const {
@@ -287,8 +298,9 @@ class FusedRunner {
         send_shared_forces();
       }
     } else {
-      const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
-        x[0] = at_corner(position_, corner);
+      // by value: a large kind gets it outside the registers
+      const auto read = [from = position_](unsigned corner, Vec3<T>(&x)[1]) {
+        x[0] = at_corner(from, corner);
       };
       if constexpr (HasStencils) {
         double energy = 0;

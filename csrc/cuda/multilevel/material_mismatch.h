@@ -17,7 +17,7 @@ class MismatchRunner {
 #pragma unroll 1
     for (int t = team_.thread(); t < w_.plan.tets; t += team_.threads()) {
       if constexpr (has_poisson_ratio) {
-        visit(Lame<T>(moduli_.youngs[t], moduli_.poisson[t]).matrix(), t);
+        visit(moduli_.lame(t).matrix(), t);
       } else {
         visit(moduli_.youngs[t], t);
       }

@@ -253,7 +253,7 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
         patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, first);
   double energy = double(sum);
   if constexpr (Stencils::any) {
-    const auto read = [&](unsigned corner, Vec3<T>(&x)[1]) {
+    const auto read = [slots](unsigned corner, Vec3<T>(&x)[1]) {
       x[0] = vec3(slots.load(corner & 0xffff));
     };
     const int before = (2 * patch.pairs + warp_size - 1) / warp_size;

@@ -7,5 +7,6 @@ template void run_mixed_pass<double, true>(Visit, const MixedStreamCall<double>&
                                            std::size_t, int, cudaStream_t);
 template void run_mixed_pass<double, false>(Visit, const MixedStreamCall<double>&, std::int64_t,
                                             std::size_t, int, cudaStream_t);
+template void run_mixed_begin(const MixedStreamCall<double>&, std::int64_t, cudaStream_t);
 template void run_mixed_weights(const StreamCall<double>&, std::int64_t, WeightKind, cudaStream_t);
 }  // namespace pd

@@ -21,6 +21,10 @@ template <class T, bool HasContacts>
 void run_mixed_pass(Visit what, const MixedStreamCall<T>& call, std::int64_t patches,
                     std::size_t shared, int k, cudaStream_t stream);
 
+// Makes the memory of the stencils of all environments from the origins of a step, if there is any.
+template <class T>
+void run_mixed_begin(const MixedStreamCall<T>& call, std::int64_t patches, cudaStream_t stream);
+
 // w V of the tetrahedra of `patches` patches.
 template <class T>
 void run_mixed_weights(const StreamCall<T>& call, std::int64_t patches, WeightKind kind,

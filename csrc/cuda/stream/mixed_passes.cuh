@@ -15,6 +15,16 @@ __global__ void __launch_bounds__(pass_threads, sizeof(T) == 4 ? 2 : 1)
 
 template <class T>
 __global__ void __launch_bounds__(vertex_threads)
+    mixed_begin(const __grid_constant__ MixedStreamCall<T> call) {
+  const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
+  const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
+  const Quad<T>* const origin = w.origin + patch.first_slot;
+  begin_stencils(call.stencils, w.environment, patch.index, 0,
+                 [origin](unsigned corner, Vec3<T>(&x)[1]) { x[0] = at_corner(origin, corner); });
+}
+
+template <class T>
+__global__ void __launch_bounds__(vertex_threads)
     mixed_weights(const __grid_constant__ StreamCall<T> call, WeightKind kind) {
   const StreamWork<T, false> w(call, blockIdx.x / call.step.plan.patches);
   const Patch<T> patch(w.plan, int(blockIdx.x % call.step.plan.patches));
@@ -47,6 +57,16 @@ void run_mixed_pass(Visit what, const MixedStreamCall<T>& call, std::int64_t pat
                     std::size_t shared, int k, cudaStream_t stream) {
   mixed_pass<T, HasContacts>(what)<<<blocks_of(patches), pass_threads, shared, stream>>>(call, k);
   check(cudaGetLastError());
+}
+
+template <class T>
+void run_mixed_begin(const MixedStreamCall<T>& call, std::int64_t patches, cudaStream_t stream) {
+  // no other kind has a memory
+  if constexpr (has_large_kinds) {
+    if (!call.stencils.plan.remembers) return;
+    mixed_begin<T><<<blocks_of(patches), vertex_threads, 0, stream>>>(call);
+    check(cudaGetLastError());
+  }
 }
 
 template <class T>

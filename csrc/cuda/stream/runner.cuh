@@ -125,6 +125,7 @@ class StreamRunner {
   void predict() {
     vertices<VertexTask::predict>(0);
     launcher_.run(stream_origins<T>, patches_, vertex_threads, 0, call_);
+    if (stencils_) run_mixed_begin(MixedStreamCall<T>{call_, *stencils_}, patches_, stream_);
   }
 
   void start() {
@@ -321,7 +322,8 @@ void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
 template <class T>
 StencilWork<T> arrange_mixed(Arena& arena, const MixedStep<T>& step, StreamCall<T>& call) {
   call.memory = arrange(arena, call);
-  return arrange_step_stencils(arena, step.stencils, step.effects, step.batch);
+  return arrange_step_stencils(arena, step.stencils, step.effects, step.batch,
+                               T(1 / step.settings.time_step));
 }
 
 template <class T>

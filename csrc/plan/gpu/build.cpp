@@ -347,7 +347,8 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
   const bool few = kernel == block_kernel || kernel == cluster_kernel;
   if (pieces > 0) add_parts(plan, piece, pieces, few ? small_part : int(vertices));
   plan.sizes = count_sizes(plan, made, elements.tet_count, pieces, kernel);
-  plan.sizes[size_members] = elements.averaged.is_empty() ? 0 : elements.averaged.members;
+  const bool large = std::ranges::any_of(elements.groups, [](const auto& g) { return g.large; });
+  if (large || !elements.averaged.is_empty()) plan.sizes[size_members] = elements.averaged.members;
   progress(1.0);
   return plan;
 }

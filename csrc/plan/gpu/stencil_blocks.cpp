@@ -20,6 +20,7 @@ void fill_lane(DeviceMeshPlan& plan, const StencilGroup& group, std::int64_t s,
                EntryChoice& choice) {
   const std::int32_t* row = &plan.stencil_block[4 * block];
   plan.stencil_order[block * lanes + lane] = std::int32_t(s);
+  plan.stencil_row[block * lanes + lane] = std::int32_t(group.row ? group.row[s] : s);
   plan.stencil_measure[block * lanes + lane] = padding ? 0 : group.measure[s];
   plan.stencil_bound[block * lanes + lane] = stencil_bound(group, s);
   for (int c = 0; c < group.corners; ++c) {
@@ -57,6 +58,7 @@ void number_stencils(DeviceMeshPlan& plan, const MeshElements& elements,
   }
   const std::size_t blocks = plan.stencil_block.size() / 4;
   plan.stencil_order.resize(blocks * lanes);
+  plan.stencil_row.resize(blocks * lanes);
   plan.stencil_measure.resize(blocks * lanes);
   plan.stencil_bound.resize(blocks * lanes);
   plan.stencil_corner.resize(std::size_t(corners) * lanes);

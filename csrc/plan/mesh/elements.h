@@ -17,6 +17,7 @@ struct StencilGroup {
   const double* measure = nullptr;       // [count] V
   const double* constant = nullptr;      // [count, constants]
   const std::int64_t* row = nullptr;     // [count] of the material; null: their own numbers
+  bool large = false;                    // see elements/stencil.h
   bool quadratic = false;                // whether their energy is p[0] / 2 |F|^2
 };
 

@@ -19,14 +19,20 @@ def _case(*parts: object) -> Case:
     return stirred(Case(scene, rest, 0.0 * rest, 1.0 / 60.0), size=0.002)
 
 
-def _block(poisson: float = 0.0, averaging: int | None = None) -> pd.Solid:
-    return pd.Solid(pd.TetMesh(*box((0.3, 0.2, 0.2), (3, 2, 2))), 2e5, poisson=poisson, averaging=averaging)
+def _block(**options: Any) -> pd.Solid:
+    return pd.Solid(pd.TetMesh(*box((0.3, 0.2, 0.2), (3, 2, 2))), 2e5, **options)
 
 
-def sheet_case(cells: tuple[int, int] = (6, 5)) -> Case:
+def block_case(**options: Any) -> Case:
+    """A held block; `options` of the solid."""
+    body = _block(**options)
+    return _case(body, pd.Pin(body, body.mesh.vertices[:, 0] == 0.0), pd.Gravity())
+
+
+def sheet_case(cells: tuple[int, int] = (6, 5), **options: Any) -> Case:
     """Cloth held at an edge: triangles, hinges with a curvature at rest, threads."""
     mesh = surface(size=(0.6, 0.5), cells=cells)
-    body = cloth(mesh, bending=1e-4, rest_curvature=0.5, warp=200.0, weft=50.0, grain=(1.0, 0.0, 0.3))
+    body = cloth(mesh, bending=1e-4, rest_curvature=0.5, warp=200.0, weft=50.0, grain=(1.0, 0.0, 0.3), **options)
     return _case(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity((1.0, -9.8, 0.5)), pd.Damping(1.0))
 
 
@@ -62,10 +68,10 @@ def rod_case() -> Case:
     return _case(body, pd.Pin(body, [0, 1]), pd.Gravity())
 
 
-def spring_case(**ratio: Any) -> Case:
-    """Two blocks joined by springs, one of them held; `ratio`: that of Poisson and the averaging of one of them."""
+def spring_case(**options: Any) -> Case:
+    """Two blocks joined by springs, one of them held, with `options`."""
     body, other = (
-        _block(**ratio),
+        _block(**options),
         pd.Solid(pd.TetMesh(*box((0.2, 0.2, 0.2), (2, 2, 2))).translated((0.35, 0.0, 0.0)), 1e5),
     )
     pairs = [[len(body.mesh.vertices) - 1, 0], [len(body.mesh.vertices) - 2, 3], [5, 7]]
@@ -73,18 +79,18 @@ def spring_case(**ratio: Any) -> Case:
     return _case(body, other, springs, pd.Pin(body, [0, 1, 2]), pd.Gravity())
 
 
-def fibre_case(**ratio: Any) -> Case:
+def fibre_case(**options: Any) -> Case:
     """A held block with active fibres and others that resist tension alone."""
-    body = _block(**ratio)
+    body = _block(**options)
     tets = np.arange(len(body.mesh.tets))
     active = pd.Fibres(body, (1.0, 0.2, 0.0), 3e5, activation=0.7, tets=tets[::2])
     passive = pd.Fibres(body, (0.0, 1.0, 0.3), 2e5, tension_only=True, tets=tets[1::3])
     return _case(body, active, passive, pd.Pin(body, body.mesh.vertices[:, 0] == 0.0), pd.Gravity())
 
 
-def mixed_case(*parts: object, **ratio: Any) -> Case:
+def mixed_case(*parts: object, **options: Any) -> Case:
     """Solid, cloth tied to it, a rod, springs and fibres, with contacts."""
-    solid = _block(**ratio)
+    solid = _block(**options)
     mesh = surface(size=(0.4, 0.3), cells=(5, 4)).translated((0.05, 0.2, 0.0))
     sheet = cloth(mesh, bending=1e-4, poisson=0.2, weft=100.0, grain=(1.0, 0.0, 0.0))
     points = np.stack([np.linspace(0.0, 0.5, 9), np.full(9, 0.4), np.full(9, 0.1)], axis=1)
@@ -112,4 +118,11 @@ CASES: dict[str, Callable[[], Case]] = {
     "fibres, poisson": lambda: fibre_case(poisson=0.36, averaging=1),
     "springs, poisson": lambda: spring_case(poisson=0.3, averaging=2),
     "mixed, poisson": lambda: mixed_case(poisson=0.38, averaging=4),
+    "limits": lambda: block_case(strain_limit=(0.97, 1.02), limit_stiffness=1e6),
+    "limited sheet": lambda: sheet_case(strain_limit=(0.97, 1.02), limit_stiffness=5e3),
+    "volume": lambda: block_case(poisson=0.36, law="volume"),
+    "damped": lambda: block_case(stiffness_damping=0.02),
+    "mixed, all": lambda: mixed_case(
+        poisson=0.3, averaging=2, strain_limit=(0.95, 1.04), limit_stiffness=4e5, stiffness_damping=0.01
+    ),
 }
