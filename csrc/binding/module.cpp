@@ -284,7 +284,7 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets,
   if (stencils.empty()) return arrays;
   add_kinds(plan.stencil_sizes, elements);
 #include "views/gpu_stencils.def"
-#include "views/gpu_rows.def"
+#include "views/gpu_step_rows.def"
 #undef X
   return arrays;
 }
@@ -335,7 +335,7 @@ constexpr TableRow device_plan_rows[] = {
 };
 constexpr TableRow device_stencil_rows[] = {
 #include "views/gpu_stencils.def"
-#include "views/gpu_rows.def"
+#include "views/gpu_step_rows.def"
 };
 #undef X
 

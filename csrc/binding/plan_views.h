@@ -73,12 +73,12 @@ constexpr int row_sizes_array = 0
 #define X(name, type, width, rows, meaning) +1
 constexpr int device_stencil_arrays = 0
 #include "views/gpu_stencils.def"
-#include "views/gpu_rows.def"
+#include "views/gpu_step_rows.def"
     ;
 #undef X
 static_assert(device_stencil_arrays != level_arrays);
 
-// Lengths of the arrays, by the names in cpu_stencils.def, gpu_stencils.def and gpu_rows.def.
+// Lengths of the arrays, by the names in cpu_stencils.def, gpu_stencils.def and gpu_step_rows.def.
 struct StencilRows {
   std::int64_t stencil_size, stencil_block, patch_end, stencil_corner_row, stencil_stored_row;
   std::int64_t row_size = 0, row_patch = 0, row_patch_end = 0, row_block_end = 0, row_block = 0,
@@ -284,19 +284,18 @@ DeviceStencils<T> device_stencils_view(at::TensorList arrays, int patches, const
   const Tensor& row_sizes = arrays[device_plan_arrays + row_sizes_array];
   StencilRows count = count_stencils(arrays[device_plan_arrays], patches);
   count_rows(count, row_sizes, patches);
-  DeviceStencils<T> stencils =
-      count_device_stencils<T>(arrays[device_plan_arrays].const_data_ptr<int32>(),
-                               row_sizes.const_data_ptr<int32>());
+  DeviceStencils<T> stencils = count_device_stencils<T>(
+      arrays[device_plan_arrays].const_data_ptr<int32>(), row_sizes.const_data_ptr<int32>());
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = device_plan_arrays;
   using real = T;
-#define X(name, type, width, rows, meaning)                                       \
-  check_array(arrays[at], scalar_type<type>, count.rows, width,                   \
-              std::string_view(#rows).ends_with("_size") ? on_cpu : place,       \
-              "plan." #name, meaning);                                           \
+#define X(name, type, width, rows, meaning)                                               \
+  check_array(arrays[at], scalar_type<type>, count.rows, width,                           \
+              std::string_view(#rows).ends_with("_size") ? on_cpu : place, "plan." #name, \
+              meaning);                                                                   \
   stencils.name = arrays[at++].const_data_ptr<type>();
 #include "views/gpu_stencils.def"
-#include "views/gpu_rows.def"
+#include "views/gpu_step_rows.def"
 #undef X
   stencils.stencil_end = stencils.patch_stencil + 1;
   return stencils;

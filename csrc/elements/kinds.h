@@ -103,7 +103,8 @@ struct ArraysOf {
   // whether a scene may lack an array, which is zero then
   PD_HD constexpr bool may_lack(int wanted) const {
     for (int i = 0; i < count; ++i) {
-      if (effect[i] == wanted) return of_tets || (quadratic_arrays<Kind> > 0 && i >= quadratic_arrays<Kind>);
+      if (effect[i] == wanted)
+        return of_tets || (quadratic_arrays<Kind> > 0 && i >= quadratic_arrays<Kind>);
     }
     return false;
   }

@@ -76,7 +76,7 @@ enum StencilSize : int {
 
 // Entries of a GPU plan's array of sizes of rows.
 enum RowSize : int {
-  row_lines,          // rows of row_neighbour
+  row_lines,  // rows of row_neighbour
   row_blocks,
   row_terms,
   row_slots,          // slots of all patches
@@ -142,7 +142,7 @@ struct DeviceStencils {
   using real = T;
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/gpu_stencils.def"
-#include "views/gpu_rows.def"
+#include "views/gpu_step_rows.def"
 #undef X
   const int32* stencil_end = nullptr;  // [patches] end of the blocks of stencils that are elements
   int blocks = 0, number_rows = 0;     // blocks of 32 stencils; rows of 32 numbers of a step

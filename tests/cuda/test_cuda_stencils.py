@@ -274,7 +274,9 @@ def test_flat_hinges_and_ties_are_rows(kernel: str, precision: str) -> None:
     taken = {}
     for name in ("flat sheet", "free sheet", "mixed", "ties", "sheet", "rod"):
         plan = on_gpu(CASES[name](), DTYPES[precision], kernel).plan
-        taken[name] = [bool(plan.row_sizes[ROW_SIZES["kinds"]] >> list(KINDS).index(kind) & 1) for kind in ("hinge", "tie")]
+        taken[name] = [
+            bool(plan.row_sizes[ROW_SIZES["kinds"]] >> list(KINDS).index(kind) & 1) for kind in ("hinge", "tie")
+        ]
         assert (plan.step_entries < plan.size("most_entries")) == any(taken[name])
     assert taken == {
         "flat sheet": [True, False], "free sheet": [True, False], "mixed": [True, True], "ties": [False, True],

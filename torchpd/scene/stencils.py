@@ -80,7 +80,7 @@ class StencilGroup:
 
     @property
     def is_quadratic(self) -> bool:
-        """Whether the energy is w/2 |F|^2 and stays so: rows that would change it are zero, and no simulator has them."""
+        """Whether the energy is w/2 |F|^2 and stays so: rows that would change it are zero, and left out."""
         count = KINDS[self.kind].quadratic
         return count > 0 and not any(self.material[name].any() for name in KINDS[self.kind].rows[count:])
 

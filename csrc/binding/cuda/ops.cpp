@@ -64,11 +64,12 @@ struct Cuda {
   static void check_rows([[maybe_unused]] const Step<T>& call) {
 #define KIND(name, type, what)
 #define PARAMETER(kind, array)                                                            \
-    TORCH_CHECK_VALUE(!(call.stencils.rows[row_kinds] >> int(KindNumber::kind) & 1) ||    \
-                          !ArraysOf<TypeOf<KindNumber::kind>>().may_lack(effect_##array) || \
-                          !call.effects.array.data,                                       \
-                      "material." #array " must be empty for the plan of a scene without it; " \
-                      "compile a scene that has it");
+  TORCH_CHECK_VALUE(!(call.stencils.rows[row_kinds] >> int(KindNumber::kind) & 1) ||      \
+                        !ArraysOf<TypeOf<KindNumber::kind>>().may_lack(effect_##array) || \
+                        !call.effects.array.data,                                         \
+                    "material." #array                                                    \
+                    " must be empty for the plan of a scene without it; "                 \
+                    "compile a scene that has it");
 #include "elements/kinds.def"
 #undef KIND
   }

@@ -69,7 +69,8 @@ template <class T>
 void compute_row_numbers(const StencilWork<T>& work, std::int64_t batch, cudaStream_t stream) {
   if (!work.plan.has_rows()) return;
   const std::int64_t sets = work.row_stride ? batch : 1;
-  const std::int64_t each = work.plan.numbers_of_rows() - work.plan.rows[row_blocks] * stencil_lanes;
+  const std::int64_t each =
+      work.plan.numbers_of_rows() - work.plan.rows[row_blocks] * stencil_lanes;
   row_numbers<T><<<blocks_of((sets * each + row_number_threads - 1) / row_number_threads),
                    row_number_threads, 0, stream>>>(work, sets);
   check(cudaGetLastError());

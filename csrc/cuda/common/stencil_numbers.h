@@ -25,8 +25,7 @@ StencilWork<T> arrange_stencils(Arena& arena, const DeviceStencils<T>& plan,
 // The same for a step, with the numbers of its rows.
 template <class T>
 StencilWork<T> arrange_step_stencils(Arena& arena, const DeviceStencils<T>& plan,
-                                     const Effects<T>& effects, std::int64_t batch,
-                                     T per_time) {
+                                     const Effects<T>& effects, std::int64_t batch, T per_time) {
   StencilWork<T> work = arrange_stencils(arena, plan, effects, batch, per_time);
   if (!plan.has_rows()) return work;
   work.row_stride = work.stride ? plan.numbers_of_rows() : 0;

@@ -1,4 +1,4 @@
-// Quadratic stencils of a patch in a step, as rows of a matrix (views/gpu_rows.def): a warp takes a block of 32 vertices.
+// Quadratic stencils of a patch in a step, as rows of a matrix (views/gpu_step_rows.def): a warp takes a block of 32 vertices.
 //
 //   force on v = sum_u t_vu (x_u - x_v),   E = -1/4 sum_v sum_u t_vu |x_u - x_v|^2
 //
@@ -27,8 +27,8 @@ struct Rows {
   }
   // of the majoriser if `bounded`, else of the stiffness at rest
   PD_DEVICE T diagonal(int block, bool bounded) const {
-    const std::int64_t before = 2 * std::int64_t(plan.rows[row_lines]) +
-                                (bounded ? plan.rows[row_blocks] : 0) + block;
+    const std::int64_t before =
+        2 * std::int64_t(plan.rows[row_lines]) + (bounded ? plan.rows[row_blocks] : 0) + block;
     return numbers[before * row_lanes + int(threadIdx.x) % 32];
   }
 };
@@ -97,8 +97,7 @@ PD_DEVICE double each_stencil_of_step(const StencilWork<T>& work, std::int64_t e
   const double energy =
       double(each_stencil<1>(work, environment, patch, before, read, entries, element));
   const int elements = work.plan.stencil_end[patch] - work.plan.patch_stencil[patch];
-  return energy +
-         each_row(work, environment, patch, before + elements, read, entries, element);
+  return energy + each_row(work, environment, patch, before + elements, read, entries, element);
 }
 
 // Prefetches what the rows of a patch read, but for that of the last block, into the L2 cache.

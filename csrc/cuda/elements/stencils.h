@@ -22,7 +22,7 @@ struct StencilWork {
   std::int64_t stride = 0;  // from one environment to the next
   T* rows = nullptr;        // [batch or 1, numbers_of_rows] of a step
   std::int64_t row_stride = 0;
-  T per_time = T(0);        // 1 / h, or 0 where energies that dissipate do not count
+  T per_time = T(0);  // 1 / h, or 0 where energies that dissipate do not count
 
   PD_HD T* numbers_of(std::int64_t environment) const { return numbers + environment * stride; }
 };

@@ -214,8 +214,9 @@ class FusedRunner {
     if (!stencils_.work.plan.remembers) return;
     __syncthreads();
     const int before = (patch_.pairs + pair_lanes - 1) / pair_lanes;
-    pd::begin_stencils(stencils_.work, in_.environment, patch_.index, before,
-                       [from = origin_](unsigned corner, Vec3<T>(&x)[1]) { x[0] = at_corner(from, corner); });
+    pd::begin_stencils(
+        stencils_.work, in_.environment, patch_.index, before,
+        [from = origin_](unsigned corner, Vec3<T>(&x)[1]) { x[0] = at_corner(from, corner); });
     __syncthreads();
   }
 
@@ -305,12 +306,11 @@ class FusedRunner {
       if constexpr (HasStencils) {
         double energy = 0;
         if (patch_.pairs > 0)
-          energy = double(each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_,
-                                       element));
+          energy = double(
+              each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_, element));
         const int blocks = (patch_.pairs + pair_lanes - 1) / pair_lanes;
         return energy + each_stencil_of_step(stencils_.work, in_.environment, patch_.index, blocks,
-                                             read, entries_,
-                                             on_stencils(element, set_.weighted));
+                                             read, entries_, on_stencils(element, set_.weighted));
       } else {
         return each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_, element);
       }

@@ -1,4 +1,4 @@
-// Compiles the elements of a scene into the arrays of views/gpu_plan.def, gpu_stencils.def and gpu_rows.def: patches,
+// Compiles the elements of a scene into the arrays of views/gpu_plan.def, gpu_stencils.def and gpu_step_rows.def: patches,
 // pairs, stencils, rows, gather lists and rest shapes.
 #pragma once
 
@@ -18,7 +18,7 @@ struct DeviceMeshPlan {
 #define X(name, type, width, rows, meaning) std::vector<type> name;
 #include "views/gpu_plan.def"
 #include "views/gpu_stencils.def"
-#include "views/gpu_rows.def"
+#include "views/gpu_step_rows.def"
 #undef X
 };
 

@@ -92,9 +92,8 @@ void add_stencils(MeshPatch& patch, const MeshElements& all, std::span<const std
     if (!own.number.empty()) patch.stencils.push_back(std::move(own));
   }
   // a step takes the others as rows
-  std::stable_partition(
-      patch.stencils.begin(), patch.stencils.end(),
-      [&](const PatchStencils& own) { return !all.groups[own.group].quadratic; });
+  std::stable_partition(patch.stencils.begin(), patch.stencils.end(),
+                        [&](const PatchStencils& own) { return !all.groups[own.group].quadratic; });
 }
 
 // `number` [vertices] is -1 before and after the call.

@@ -52,12 +52,12 @@ struct Entries {
   void place(bool piped);
 };
 
-// The rows of the quadratic stencils in a patch, see views/gpu_rows.def. A term counts stencils from the patch's first.
+// The rows of the quadratic stencils in a patch, see views/gpu_step_rows.def. A term counts stencils from the patch's first.
 struct PatchRows {
-  std::vector<std::int32_t> slot;       // of each row, 32 in a block; -1: padding
-  std::vector<std::int32_t> width;      // pairs of neighbours of each block
-  std::vector<std::int32_t> neighbour;  // row_neighbour
-  std::vector<std::int32_t> count, term;                    // terms of each t
+  std::vector<std::int32_t> slot;         // of each row, 32 in a block; -1: padding
+  std::vector<std::int32_t> width;        // pairs of neighbours of each block
+  std::vector<std::int32_t> neighbour;    // row_neighbour
+  std::vector<std::int32_t> count, term;  // terms of each t
   std::vector<std::int32_t> diagonal_count, diagonal_term;  // and of each diagonal
 };
 
@@ -68,7 +68,7 @@ struct MeshPatch : Entries {
   std::vector<PatchStencils> stencils;
   std::int64_t outer = 0;    // number of leading pairs that may touch shared vertices
   std::int64_t coupled = 0;  // number of leading pairs that average with their neighbour
-  Entries step;   // with rows: those of a step
+  Entries step;              // with rows: those of a step
   PatchRows rows;
   bool piped = false;  // whether cuda/stream/pipeline.h reads and writes the entries
 

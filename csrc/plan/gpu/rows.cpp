@@ -100,7 +100,8 @@ void add_block(PatchRows& to, const std::vector<Row>& rows, std::size_t first,
       std::array<std::int64_t, 2> neighbour;
       for (std::size_t side = 0; side < 2; ++side) {
         const bool there = 2 * k + side < of.neighbours.size();
-        const auto run = there ? of.neighbours[2 * k + side] : std::pair<std::size_t, std::size_t>{};
+        const auto run =
+            there ? of.neighbours[2 * k + side] : std::pair<std::size_t, std::size_t>{};
         neighbour[side] = there ? terms[run.first].neighbour : of.slot;
         add_number(terms, run, to.count, to.term);
       }
@@ -124,9 +125,9 @@ void check_stencils(const DeviceMeshPlan& plan, std::size_t patches) {
   const std::int64_t stencils = std::ssize(plan.stencil_order);
   if (stencils < most_stencils) return;
   throw std::overflow_error("patches = " + std::to_string(patches) + ": they would have " +
-                            std::to_string(stencils) + " stencils, padding included, and terms of " +
-                            "32 bits count up to " + std::to_string(most_stencils) +
-                            "; take a coarser mesh");
+                            std::to_string(stencils) +
+                            " stencils, padding included, and terms of " + "32 bits count up to " +
+                            std::to_string(most_stencils) + "; take a coarser mesh");
 }
 
 }  // namespace

@@ -1,4 +1,4 @@
-// Quadratic stencils as rows of a matrix: the arrays of views/gpu_rows.def.
+// Quadratic stencils as rows of a matrix: the arrays of views/gpu_step_rows.def.
 #pragma once
 
 #include "plan/gpu/build.h"
