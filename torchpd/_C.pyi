@@ -6,7 +6,9 @@ from typing import Any
 from numpy import float64, int32, int64
 from numpy.typing import NDArray
 
-Stencils = list[tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64], NDArray[int64] | None, bool]]
+Stencils = list[
+    tuple[int, NDArray[int64], NDArray[float64], NDArray[float64], NDArray[float64], NDArray[int64] | None, bool]
+]
 
 def build_plan(
     positions: NDArray[float64],
