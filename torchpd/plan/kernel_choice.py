@@ -20,8 +20,8 @@ tetrahedra and exchange the forces on shared vertices.
 A group of tetrahedra that averages its volume strain lies in one patch. The patches of a cluster would cut it, so
 solids with Poisson's ratio run as "block", "grid" or "stream".
 
-Scenes with stencils (cloth, rods, springs, ties, fibres, limits, damping) run as "block" where the mesh fits the shared memory of a
-block, else as "stream".
+Scenes with stencils (cloth, rods, springs, ties, fibres, limits, damping) run as "block" where the mesh fits the shared
+memory of a block, else as "stream".
 
 The batch of a state has no influence: an environment gives the same bits alone and in any batch.
 """

@@ -81,7 +81,6 @@ __device__ void write_products(const MixedFieldWork<T>& work, const PatchFields<
   const T* const numbers = work.stencils.numbers_of(fields.environment);
   for (int i = 0; i < memory_of<Kind>; ++i)
     memory[i] = numbers[place.number_of_step(Kind::numbers - memory_of<Kind> + i)];
-#pragma unroll 1
   for (int a = 0; a < arrays.count; ++a) {
     T* out = work.effects.products[arrays.effect[a]];
     if (!out) continue;

@@ -76,7 +76,7 @@ def spring_case(**options: Any) -> Case:
     )
     pairs = [[len(body.mesh.vertices) - 1, 0], [len(body.mesh.vertices) - 2, 3], [5, 7]]
     springs = pd.Springs(body, pairs, [300.0, 500.0, 200.0], [0.02, 0.1, 0.3], other=other)
-    return _case(body, other, springs, pd.Pin(body, [0, 1, 2]), pd.Gravity())
+    return _case(other, body, springs, pd.Pin(body, [0, 1, 2]), pd.Gravity())
 
 
 def fibre_case(**options: Any) -> Case:
@@ -119,9 +119,9 @@ CASES: dict[str, Callable[[], Case]] = {
     "springs, poisson": lambda: spring_case(poisson=0.3, averaging=2),
     "mixed, poisson": lambda: mixed_case(poisson=0.38, averaging=4),
     "limits": lambda: block_case(strain_limit=(0.97, 1.02), limit_stiffness=1e6),
-    "limited sheet": lambda: sheet_case(strain_limit=(0.97, 1.02), limit_stiffness=5e3),
+    "limited sheet": lambda: sheet_case(strain_limit=(0.985, 1.01), limit_stiffness=5e3),
     "volume": lambda: block_case(poisson=0.36, law="volume"),
-    "damped": lambda: block_case(stiffness_damping=0.02),
+    "damped": lambda: spring_case(stiffness_damping=0.02),
     "mixed, all": lambda: mixed_case(
         poisson=0.3, averaging=2, strain_limit=(0.95, 1.04), limit_stiffness=4e5, stiffness_damping=0.01
     ),
