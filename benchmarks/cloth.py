@@ -21,8 +21,8 @@ import torchpd as pd
 from torchpd.plan.cpu_plan import Plan
 
 TIME_STEP = 1 / 60
-# u, the previous iterate and the target are read, one of them is written; each slot reads u, origin and rest position
-_VERTEX_VECTORS, _SLOT_VECTORS = 4, 3
+# u, the previous iterate and the target are read, one of them is written; each slot reads u and origin
+_VERTEX_VECTORS, _SLOT_VECTORS = 4, 2
 
 
 class ClothScene(NamedTuple):
@@ -58,8 +58,16 @@ def sheet(cells: tuple[int, int]) -> pd.TriMesh:
 def stream_bytes(plan: Plan, batch: int) -> int:
     """Bytes that an iteration of kernel stream reads and writes at least."""
     real = torch.finfo(plan.dtype).bits // 8
-    numbers = int(plan.stencil_sizes[3]) * 32 * real
-    elements = plan.stencil_corner.nbytes + plan.stencil_stored.nbytes + numbers
+    # rows of 32 corners, stored numbers and numbers of a step, of each block of stencils that are elements
+    first = plan.stencil_block[:, 1:].cpu()
+    rows = torch.diff(torch.cat([first, plan.stencil_sizes[None, 1:4]]), dim=0)
+    if len(plan.patch_element):
+        block = torch.arange(len(rows))
+        patch = torch.searchsorted(plan.patch_stencil.cpu(), block, right=True) - 1
+        rows = rows[block < plan.patch_element.cpu()[patch]]
+    elements = 32 * int((rows.sum(dim=0) * torch.tensor([4, real, real])).sum())
+    # then the rows of quadratic ones: two neighbours and their numbers
+    elements += plan.row_corner.nbytes + plan.row_neighbour.nbytes + 2 * real * plan.row_neighbour.numel()
     state = 4 * real * (_VERTEX_VECTORS * plan.vertices + _SLOT_VECTORS * plan.size("slots"))
     return batch * (elements + state)
 

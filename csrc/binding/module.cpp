@@ -70,7 +70,8 @@ struct KindShape {
   bool of_tets;  // whether it reads the material of tetrahedra
   std::vector<std::string> rows;
   const char* meaning;
-  bool large;  // see elements/stencil.h
+  bool large;     // see elements/stencil.h
+  int quadratic;  // arrays that make its energy quadratic; 0: none do
 };
 
 std::vector<KindShape> kind_shapes() {
@@ -84,16 +85,17 @@ std::vector<KindShape> kind_shapes() {
                    pd::reads_tets<pd::type>, \
                    {},                       \
                    what,                     \
-                   pd::is_large<pd::type>});
+                   pd::is_large<pd::type>,   \
+                   pd::quadratic_arrays<pd::type>});
 #define PARAMETER(name, array) kinds.back().rows.push_back(#array);
 #include "elements/kinds.def"
 #undef KIND
   return kinds;
 }
 
-// Stencils of one kind as Python gives them: kind, corners, g_a, V, constants, and the tetrahedron of each if the kind
-// reads its material.
-using Stencils = std::tuple<int, Indices, Doubles, Doubles, Doubles, std::optional<Indices>>;
+// Stencils of one kind as Python gives them: kind, corners, g_a, V, constants, the tetrahedron of each if the kind
+// reads its material, and whether their energy is quadratic.
+using Stencils = std::tuple<int, Indices, Doubles, Doubles, Doubles, std::optional<Indices>, bool>;
 
 void check_tets_of(const KindShape& shape, const std::optional<Indices>& row, py::ssize_t count,
                    std::int64_t tets) {
@@ -111,7 +113,7 @@ void check_tets_of(const KindShape& shape, const std::optional<Indices>& row, py
 }
 
 pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std::int64_t tets) {
-  const auto& [kind, corner, gradient, measure, constant, row] = given;
+  const auto& [kind, corner, gradient, measure, constant, row, quadratic] = given;
   const std::vector<KindShape> shapes = kind_shapes();
   if (kind < 0 || kind >= std::ssize(shapes))
     throw py::value_error("the kind of stencils must be a row of kind_table");
@@ -134,6 +136,8 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std
                             ": corners refer to vertices that positions does not have");
   }
   check_tets_of(shape, row, count, tets);
+  if (quadratic && shape.quadratic == 0)
+    throw py::value_error(std::string(shape.name) + ": this kind has no quadratic energy");
   return {kind,
           shape.corners,
           shape.dims,
@@ -145,7 +149,8 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std
           measure.data(),
           constant.data(),
           row ? row->data() : nullptr,
-          shape.large};
+          shape.large,
+          quadratic};
 }
 
 // Checks the elements of a scene; the arrays stay the caller's.
@@ -279,6 +284,7 @@ py::dict build_device_plan(const Doubles& positions, const Indices& tets,
   if (stencils.empty()) return arrays;
   add_kinds(plan.stencil_sizes, elements);
 #include "views/gpu_stencils.def"
+#include "views/gpu_step_rows.def"
 #undef X
   return arrays;
 }
@@ -329,6 +335,7 @@ constexpr TableRow device_plan_rows[] = {
 };
 constexpr TableRow device_stencil_rows[] = {
 #include "views/gpu_stencils.def"
+#include "views/gpu_step_rows.def"
 };
 #undef X
 
@@ -374,7 +381,7 @@ py::list kind_table() {
   py::list rows;
   for (const KindShape& kind : kind_shapes())
     rows.append(py::make_tuple(kind.name, kind.corners, kind.dims, kind.constants,
-                               py::tuple(py::cast(kind.rows)), kind.meaning));
+                               py::tuple(py::cast(kind.rows)), kind.meaning, kind.quadratic));
   return rows;
 }
 
@@ -424,12 +431,15 @@ std::int64_t bytes_of([[maybe_unused]] const pd::MixedStep<T>& step) {
 
 template <class T>
 std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes,
-                        const Numbers& stencil_sizes, int schedule, std::int64_t batch, int planes,
-                        int spheres, bool own_stiffness, bool own_effects) {
+                        const Numbers& stencil_sizes, const Numbers& row_sizes, int schedule,
+                        std::int64_t batch, int planes, int spheres, bool own_stiffness,
+                        bool own_effects) {
   const bool levels = level_sizes.size() > 0, stencils = stencil_sizes.size() > 0;
   if (sizes.size() != pd::size_count || (levels && level_sizes.size() != pd::level_size_count) ||
-      (stencils && stencil_sizes.size() != pd::stencil_size_count + int(pd::KindNumber::count)))
-    throw py::value_error("sizes, level_sizes and stencil_sizes must be those of a plan for a GPU");
+      (stencils && (stencil_sizes.size() != pd::stencil_size_count + int(pd::KindNumber::count) ||
+                    row_sizes.size() != pd::row_size_count)))
+    throw py::value_error(
+        "sizes, level_sizes, stencil_sizes and row_sizes must be those of a plan for a GPU");
   pd::MixedStep<T> step;
   step.plan = pd::count_device_plan<T>(sizes.data());
   if (levels) step.plan.levels = pd::count_levels<T>(level_sizes.data(), step.plan.vertices);
@@ -438,9 +448,8 @@ std::int64_t step_bytes(const Numbers& sizes, const Numbers& level_sizes,
   step.material.planes_count = planes;
   step.material.spheres_count = spheres;
   step.material.stiffness.stride = own_stiffness ? step.plan.tets : 0;
-  if (stencils) {
-    step.stencils = pd::count_device_stencils<T>(stencil_sizes.data());
-  }
+  if (stencils)
+    step.stencils = pd::count_device_stencils<T>(stencil_sizes.data(), row_sizes.data());
   step.effects.stiffness = step.material.stiffness;
   // whichever of them it is
   step.effects.bending.stride = own_effects ? 1 : 0;
@@ -492,7 +501,8 @@ PYBIND11_MODULE(_C, m) {
       "stencil_table", [] { return table(stencil_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays of stencils, in op order.");
   m.def("kind_table", &kind_table,
-        "Rows (name, corners, dims, constants, arrays, meaning) of the kinds of stencils.");
+        "Rows (name, corners, dims, constants, arrays, meaning, quadratic) of the kinds of "
+        "stencils.");
   m.def(
       "multilevel_table", [] { return table(multilevel_rows); },
       "Rows (name, type, width, rows, meaning) of a preconditioner's arrays, in op order.");
@@ -501,7 +511,16 @@ PYBIND11_MODULE(_C, m) {
       "Rows (name, type, width, rows, meaning) of the constant arrays on a GPU, in op order.");
   m.def(
       "device_stencil_table", [] { return table(device_stencil_rows); },
-      "Rows (name, type, width, rows, meaning) of the arrays of stencils on a GPU, in op order.");
+      "Rows (name, type, width, rows, meaning) of the arrays of stencils and of their rows on a "
+      "GPU, in op order.");
+  m.def(
+      "row_sizes",
+      [] {
+        return py::dict(py::arg("step_entries") = int(pd::row_step_entries),
+                        py::arg("kinds") = int(pd::row_kinds),
+                        py::arg("blocks") = int(pd::row_blocks));
+      },
+      "Places of counts in row_sizes of a GPU plan.");
   m.def("device_sizes", &device_sizes, "Names of the numbers in a GPU plan's sizes.");
   m.def("material_table", &material_table,
         "Rows (name, width, rows, meaning, effect) of the differentiable arrays, in op order.");
@@ -540,17 +559,17 @@ PYBIND11_MODULE(_C, m) {
   m.def(
       "step_bytes",
       [](std::size_t real, const Numbers& sizes, const Numbers& level_sizes,
-         const Numbers& stencil_sizes, int schedule, std::int64_t batch, int planes, int spheres,
-         bool own_stiffness, bool own_effects) {
+         const Numbers& stencil_sizes, const Numbers& row_sizes, int schedule, std::int64_t batch,
+         int planes, int spheres, bool own_stiffness, bool own_effects) {
         const auto bytes = real == sizeof(float) ? step_bytes<float> : step_bytes<double>;
-        return bytes(sizes, level_sizes, stencil_sizes, schedule, batch, planes, spheres,
+        return bytes(sizes, level_sizes, stencil_sizes, row_sizes, schedule, batch, planes, spheres,
                      own_stiffness, own_effects);
       },
       py::arg("real"), py::arg("sizes"), py::arg("level_sizes"), py::arg("stencil_sizes"),
-      py::arg("schedule"), py::arg("batch"), py::arg("planes"), py::arg("spheres"),
-      py::arg("own_stiffness"), py::arg("own_effects"),
+      py::arg("row_sizes"), py::arg("schedule"), py::arg("batch"), py::arg("planes"),
+      py::arg("spheres"), py::arg("own_stiffness"), py::arg("own_effects"),
       "Memory that the current CUDA device wants for a step; level_sizes: none without a "
-      "preconditioner; stencil_sizes: none without stencils.");
+      "preconditioner; stencil_sizes, row_sizes: none without stencils.");
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
   m.attr("corotation_bytes") = pd::corotation_bytes;
   m.attr("outlier_ratio") = pd::outlier_ratio;

@@ -63,16 +63,26 @@ constexpr int stencil_arrays = 0
 #undef X
 static_assert(stencil_arrays != level_arrays);  // the number of arrays tells what follows
 
+// The place of row_sizes in the tables.
+#define X(name, type, width, rows, meaning) +1
+constexpr int row_sizes_array = 0
+#include "views/gpu_stencils.def"
+    ;
+#undef X
+
 #define X(name, type, width, rows, meaning) +1
 constexpr int device_stencil_arrays = 0
 #include "views/gpu_stencils.def"
+#include "views/gpu_step_rows.def"
     ;
 #undef X
 static_assert(device_stencil_arrays != level_arrays);
 
-// Lengths of the arrays, by the names in cpu_stencils.def and gpu_stencils.def.
+// Lengths of the arrays, by the names in cpu_stencils.def, gpu_stencils.def and gpu_step_rows.def.
 struct StencilRows {
   std::int64_t stencil_size, stencil_block, patch_end, stencil_corner_row, stencil_stored_row;
+  std::int64_t row_size = 0, row_patch = 0, row_patch_end = 0, row_block_end = 0, row_block = 0,
+               row = 0, term_end = 0, term = 0, row_slot = 0, row_pair = 0, row_corner_row = 0;
 };
 
 // The counts of the stencils, of every kind too.
@@ -248,22 +258,46 @@ inline bool has_device_stencils(at::TensorList arrays) {
   return arrays.size() == device_plan_arrays + device_stencil_arrays;
 }
 
+// Adds the lengths of the arrays of rows.
+inline void count_rows(StencilRows& count, const Tensor& sizes, int patches) {
+  check_array(sizes, at::kInt, row_size_count, 1, {at::kCPU, "every plan's sizes"},
+              "plan.row_sizes", "counts");
+  const int32* size = sizes.const_data_ptr<int32>();
+  count.row_size = row_size_count;
+  if (size[row_blocks] == 0) return;
+  count.row_patch = patches;
+  count.row_patch_end = patches + 1;
+  count.row_block = size[row_blocks];
+  count.row_block_end = count.row_block + 1;
+  count.row = size[row_lines];
+  count.term_end = std::int64_t(32) * (2 * count.row + count.row_block) + 1;
+  count.term = size[row_terms];
+  count.row_slot = size[row_slots];
+  count.row_pair = size[row_pair_blocks];
+  count.row_corner_row = size[row_corner_rows];
+}
+
 // The arrays of the stencils, without any if the plan has none.
 template <class T>
 DeviceStencils<T> device_stencils_view(at::TensorList arrays, int patches, const Place& place) {
   if (!has_device_stencils(arrays)) return {};
-  const StencilRows count = count_stencils(arrays[device_plan_arrays], patches);
-  DeviceStencils<T> stencils =
-      count_device_stencils<T>(arrays[device_plan_arrays].const_data_ptr<int32>());
+  const Tensor& row_sizes = arrays[device_plan_arrays + row_sizes_array];
+  StencilRows count = count_stencils(arrays[device_plan_arrays], patches);
+  count_rows(count, row_sizes, patches);
+  DeviceStencils<T> stencils = count_device_stencils<T>(
+      arrays[device_plan_arrays].const_data_ptr<int32>(), row_sizes.const_data_ptr<int32>());
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = device_plan_arrays;
   using real = T;
-#define X(name, type, width, rows, meaning)                                       \
-  check_array(arrays[at], scalar_type<type>, count.rows, width,                   \
-              at == device_plan_arrays ? on_cpu : place, "plan." #name, meaning); \
+#define X(name, type, width, rows, meaning)                                               \
+  check_array(arrays[at], scalar_type<type>, count.rows, width,                           \
+              std::string_view(#rows).ends_with("_size") ? on_cpu : place, "plan." #name, \
+              meaning);                                                                   \
   stencils.name = arrays[at++].const_data_ptr<type>();
 #include "views/gpu_stencils.def"
+#include "views/gpu_step_rows.def"
 #undef X
+  stencils.stencil_end = stencils.patch_stencil + 1;
   return stencils;
 }
 
@@ -418,13 +452,13 @@ inline Tensor stiffness_of(at::TensorList material, std::int64_t tets) {
   return stiffness.contiguous();
 }
 
-// Arrays of tetrahedra may be absent: zeros.
+// Arrays of tetrahedra, and those without which an energy is quadratic, may be absent: zeros.
 inline void check_effect(at::TensorList material, std::string_view name, int width, bool of_tets,
-                         const char* kind, std::int64_t count) {
+                         bool may_lack, const char* kind, std::int64_t count) {
   const Tensor& array = material[place_in_material(name)];
   const int rows = width > 1 ? -2 : -1;
   TORCH_CHECK_VALUE(
-      array.dim() >= -rows && (array.size(rows) == count || (of_tets && array.numel() == 0)),
+      array.dim() >= -rows && (array.size(rows) == count || (may_lack && array.numel() == 0)),
       "material.", name, " must have a row for each of the ", count,
       of_tets ? " tetrahedra" : " stencils", of_tets ? ", which stencils" : "", " of kind ", kind,
       of_tets ? " read, got " : " in the plan, got ", describe(array));
@@ -479,7 +513,8 @@ inline void check_effects(const int32* counts, std::int64_t tets, at::TensorList
 #define KIND(kind, type, what)
 #define PARAMETER(kind, array)                                                         \
   if (const auto count = counts[int(KindNumber::kind)])                                \
-    check_effect(material, #array, array##_numbers, is_of_tets(effect_##array), #kind, \
+    check_effect(material, #array, array##_numbers, is_of_tets(effect_##array),        \
+                 ArraysOf<TypeOf<KindNumber::kind>>().may_lack(effect_##array), #kind, \
                  is_of_tets(effect_##array) ? tets : count);
 #include "elements/kinds.def"
 #undef KIND

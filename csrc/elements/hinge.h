@@ -2,14 +2,14 @@
 //
 //   F = sum_a c_a x_a / A,   A = A_0 + A_1,   c from the cotangents at the edge       (Bergou et al. 2006)
 //
-// Flat where k0 = 0: then the energy is quadratic. A rod has the same energy at three vertices, the fourth with c = 0.
+// Flat where k0 = 0, or where the scene has no k0: then the energy is quadratic. A rod has the same energy at three vertices, the fourth with c = 0.
 #pragma once
 #include "elements/length.h"
 
 namespace pd::inline PD_TARGET {
 
 struct Hinge : Length<4> {
-  static constexpr int rows = 2;
+  static constexpr int rows = 2, quadratic = 1;
 
   template <class R>
   PD_HD static void parameters(const R (&row)[2], const R& measure, R (&p)[2]) {

@@ -100,12 +100,20 @@ struct ArraysOf {
     of_tets = is_of_tets(effect[0]);
   }
   PD_HD constexpr int width(int array) const { return first[array + 1] - first[array]; }
+  // whether a scene may lack an array, which is zero then
+  PD_HD constexpr bool may_lack(int wanted) const {
+    for (int i = 0; i < count; ++i) {
+      if (effect[i] == wanted)
+        return of_tets || (quadratic_arrays<Kind> > 0 && i >= quadratic_arrays<Kind>);
+    }
+    return false;
+  }
   // all arrays have the same rows, and as many numbers as the kind reads
   constexpr bool fit() const {
     for (int i = 0; i < count; ++i) {
       if (is_of_tets(effect[i]) != of_tets) return false;
     }
-    return first[count] == Kind::rows;
+    return first[count] == Kind::rows && (quadratic_arrays<Kind> == 0 || Kind::dims == 1);
   }
 };
 #define KIND(name, type, what) static_assert(ArraysOf<type>().fit());
@@ -125,19 +133,20 @@ bool any_kind(const int32* counts, const Holds& holds) {
   return found;
 }
 
-// The counts of a plan's stencils, from their array of sizes; without the other arrays.
+// The counts of a plan's stencils and of their rows, from their arrays of sizes; without the other arrays.
 template <class T>
-DeviceStencils<T> count_device_stencils(const int32* sizes) {
+DeviceStencils<T> count_device_stencils(const int32* sizes, const int32* row_sizes) {
   DeviceStencils<T> stencils;
   const int32* const counts = sizes + stencil_size_count;
   stencils.blocks = sizes[stencil_blocks];
   stencils.number_rows = sizes[stencil_number_rows];
+  for (int i = 0; i < row_size_count; ++i) stencils.rows[i] = row_sizes[i];
   stencils.remembers = any_kind(counts, [](auto kind) { return memory_of<decltype(kind)> > 0; });
   stencils.reads_tets = any_kind(counts, [](auto kind) { return reads_tets<decltype(kind)>; });
   return stencils;
 }
 
-// The rows of those arrays in one environment. An array of tetrahedra that the scene lacks has zeros.
+// The rows of those arrays in one environment. An array that the scene lacks has zeros.
 template <class Kind, class T>
 struct MaterialRows {
   const T* row[array_count<Kind>];

@@ -12,6 +12,8 @@
 //   stress<Energy>(f, p, c, P, energy)         V P, and adds V psi to `energy`; c: constants
 //   weight(p, l, n)              V (2 mu l + n k); with l = n = 1 the stiffness at rest, for preconditioners
 //   rest_weight(p)               that stiffness where it is another one
+//   quadratic                    so many of its arrays, the first ones, make the energy p[0] / 2 |F|^2 with the weight
+//                                p[0] l_e, where the scene lacks the others; d = 1
 // Second derivatives and derivatives by the material follow from `stress` with dual numbers. A kind whose stress has no
 // derivative in dual numbers has its own
 //   hessian(f, df, p, c, dp)     dP along dF
@@ -46,6 +48,13 @@ constexpr int memory_of = 0;
 template <class Kind>
   requires requires { Kind::memory; }
 constexpr int memory_of<Kind> = Kind::memory;
+// arrays that make a quadratic energy; 0: none do
+template <class Kind>
+constexpr int quadratic_arrays = 0;
+template <class Kind>
+  requires requires { Kind::quadratic; }
+constexpr int quadratic_arrays<Kind> = Kind::quadratic;
+
 template <class Kind>
 constexpr bool dissipates = false;
 template <class Kind>

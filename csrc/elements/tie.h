@@ -6,7 +6,7 @@
 namespace pd::inline PD_TARGET {
 
 struct Tie : Length<5> {
-  static constexpr int rows = 1;
+  static constexpr int rows = 1, quadratic = 1;
 
   template <class R>
   PD_HD static void parameters(const R (&row)[1], const R& measure, R (&p)[2]) {

@@ -74,6 +74,20 @@ enum StencilSize : int {
   stencil_size_count
 };
 
+// Entries of a GPU plan's array of sizes of rows.
+enum RowSize : int {
+  row_lines,  // rows of row_neighbour
+  row_blocks,
+  row_terms,
+  row_slots,          // slots of all patches
+  row_pair_blocks,    // blocks of pairs of tetrahedra
+  row_corner_rows,    // rows of step_corner
+  row_step_entries,   // most entries of a step in a patch, padding included
+  row_step_stencils,  // blocks of stencils that are elements of a step
+  row_kinds,          // bit k: the stencils of kind k are rows
+  row_size_count
+};
+
 template <class T>
 struct EffectViews;
 template <class T>
@@ -128,10 +142,19 @@ struct DeviceStencils {
   using real = T;
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/gpu_stencils.def"
+#include "views/gpu_step_rows.def"
 #undef X
-  int blocks = 0, number_rows = 0;  // blocks of 32 stencils; rows of 32 numbers of a step
-  bool remembers = false;           // some stencils have numbers of the start of a step
-  bool reads_tets = false;          // some read the material of tetrahedra
+  const int32* stencil_end = nullptr;  // [patches] end of the blocks of stencils that are elements
+  int blocks = 0, number_rows = 0;     // blocks of 32 stencils; rows of 32 numbers of a step
+  bool remembers = false;              // some stencils have numbers of the start of a step
+  bool reads_tets = false;             // some read the material of tetrahedra
+  int rows[row_size_count] = {};
+
+  PD_HD bool has_rows() const { return rows[row_blocks] > 0; }
+  // numbers of the rows: t of all neighbours, and two diagonals
+  PD_HD std::int64_t numbers_of_rows() const {
+    return 64 * (std::int64_t(rows[row_lines]) + rows[row_blocks]);
+  }
 };
 
 // A call on a GPU with what only scenes with stencils have; blocks = 0 without them.
@@ -139,6 +162,19 @@ template <class Call>
 struct Mixed : Call, EffectViews<typename Call::real> {
   DeviceStencils<typename Call::real> stencils;
 };
+
+// A step's call, with its own entries where the plan has rows.
+template <class Call>
+Mixed<Call> with_rows(Mixed<Call> step) {
+  auto& stencils = step.stencils;
+  if (!stencils.has_rows()) return step;
+  step.plan.slot_row = stencils.step_row;
+  step.plan.pair_corner = stencils.step_pair_corner;
+  step.plan.most_entries = stencils.rows[row_step_entries];
+  stencils.stencil_corner = stencils.step_corner;
+  stencils.stencil_end = stencils.patch_element;
+  return step;
+}
 
 // The counts of a plan or its levels, from their array of sizes; without the other arrays.
 template <class T>

@@ -13,7 +13,7 @@ from runs import noise, same_bits, simulator, state_of
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.common.tables import EFFECT_ROWS
+from torchpd.common.tables import EFFECT_ROWS, KINDS, MATERIAL_TABLE, ROW_SIZES
 from torchpd.ops import INFO_WIDTH
 from torchpd.plan import kernel_choice as regimes
 from torchpd.plan.placement import step_bytes
@@ -267,6 +267,49 @@ def test_a_step_takes_what_it_is_said_to(name: str, kernel: str, precision: str)
         assert step_bytes(sim.compiled, sim.plan, batch, GPU) == taken(batch)
     sim.set_material(**{name: row.to(GPU) for name, row in own_rows(sim, 7).items()})
     assert step_bytes(sim.compiled, sim.plan, 7, GPU) == taken(7)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_flat_hinges_and_ties_are_rows(kernel: str, precision: str) -> None:
+    taken = {}
+    for name in ("flat sheet", "free sheet", "mixed", "ties", "sheet", "rod"):
+        plan = on_gpu(CASES[name](), DTYPES[precision], kernel).plan
+        taken[name] = [
+            bool(plan.row_sizes[ROW_SIZES["kinds"]] >> list(KINDS).index(kind) & 1) for kind in ("hinge", "tie")
+        ]
+        assert (plan.step_entries < plan.size("most_entries")) == any(taken[name])
+    assert taken == {
+        "flat sheet": [True, False], "free sheet": [True, False], "mixed": [True, True], "ties": [False, True],
+        "sheet": [False, False], "rod": [False, False],
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_guard_sees_the_energy_of_rows(kernel: str, precision: str) -> None:
+    """The schedule restarts when the energy rises: as often as on the CPU, where hinges are elements."""
+    case, dtype = CASES["flat sheet"](), DTYPES[precision]
+    restarts = []
+    for sim in (on_gpu(case, dtype, kernel, iterations=200), simulator(case, torch.float64, iterations=200)):
+        sim.set_material(bending=100.0)  # so stiff that rounding of its energy would show
+        state, forces = different(simulator(case, dtype), "flat sheet", 5)
+        _, info = sim(moved(state, sim.device, sim.dtype), forces.to(sim.device, sim.dtype), return_info=True)
+        restarts.append(info.restarts.cpu())
+    assert restarts[1].all()
+    if precision == "float64":
+        assert torch.equal(*restarts)
+    else:
+        assert bool(((restarts[0] - restarts[1]).abs() <= 1).all())
+
+
+def test_a_plan_with_rows_refuses_a_curvature(precision: str) -> None:
+    sim = on_gpu(CASES["flat sheet"](), DTYPES[precision], "block")
+    assert "rest_curvature" not in sim.material_names
+    material, names = [t.detach() for t in sim.material()], [row.name for row in MATERIAL_TABLE]
+    material[names.index("rest_curvature")] = torch.zeros_like(sim.bending)
+    state, plan = sim.rest_state(1), list(sim.plan.arrays)
+    settings = sim.step_settings(inertial=False, report=False)
+    with pytest.raises(ValueError, match=r"material\.rest_curvature must be empty for the plan of a scene without it"):
+        torch.ops.torchpd.step(*state, None, None, material, plan, **settings)
 
 
 def test_what_has_no_stencils_is_refused_by_name(precision: str) -> None:

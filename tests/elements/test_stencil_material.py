@@ -23,9 +23,9 @@ NAMES = {
 
 
 def everything(dtype: torch.dtype = torch.float64) -> pd.Simulator:
-    """A sheet of 32 triangles with 40 hinges, a rod of 3 segments, springs, a tie and fibres."""
+    """A sheet of 32 triangles with 40 hinges, two of them curved, a rod of 3 segments, springs, a tie and fibres."""
     solid = pd.Solid(pd.shapes.box((1, 0.3, 0.3), (1, 1, 1)), 1e5)
-    sheet = cloth(bending=1e-3, warp=20.0, grain=(1.0, 0.0, 0.0))
+    sheet = cloth(bending=1e-3, rest_curvature=0.1 * (np.arange(40) < 2), warp=20.0, grain=(1.0, 0.0, 0.0))
     rod = pd.Rod(np.linspace((0.0, 1, 0), (1, 1, 0), 4), 1e6, 1e-2)
     parts = (
         pd.Springs(rod, [[0, 2], [3, 1]], 50.0, other=sheet),
@@ -102,6 +102,9 @@ def test_an_array_that_the_scene_lacks_is_refused() -> None:
         sim.set_material(tie_stiffness=1.0)
     with pytest.raises(TypeError, match=r"no array 'bending'.*the scene has no hinge"):
         sim.set_material(bending=1.0)
+    flat = pd.Simulator(pd.Scene(cloth(bending=1e-3)), progress=False)
+    with pytest.raises(TypeError, match=r"no array 'rest_curvature'.*give a Cloth or a Rod another"):
+        flat.set_material(rest_curvature=1.0)
 
 
 def test_functional_call_vmap_and_rollout_give_the_bits_of_loops() -> None:

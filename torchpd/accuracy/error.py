@@ -188,7 +188,7 @@ def problem_of(
         damping=float(material["damping"]),
         poisson=None if values.poisson is None else material["poisson"],
         stencils=tuple(
-            dataclasses.replace(group, material={name: material[name] for name in group.material})
+            dataclasses.replace(group, material=group.material | {name: material[name] for name in group.trainable})
             for group in values.stencils
         ),
     )

@@ -16,6 +16,7 @@ __all__ = [
     "MULTILEVEL_TABLE",
     "PLANES",
     "PLAN_TABLE",
+    "ROW_SIZES",
     "SETTINGS_TABLE",
     "SPHERES",
     "STENCIL_TABLE",
@@ -60,6 +61,7 @@ class Kind(NamedTuple):
     constants: int  # further constants of a stencil
     rows: tuple[str, ...]  # names of its arrays in the material
     meaning: str
+    quadratic: int  # its first arrays that make a quadratic energy where a scene lacks the others; 0: none do
 
     @property
     def of_tets(self) -> bool:
@@ -102,3 +104,5 @@ SETTINGS_TABLE = tuple(SettingRow(*row) for row in _C.settings_table())
 PLANES, SPHERES = (_columns(array) for array in ("planes", "spheres"))
 # names of the `sizes` of a GPU plan: csrc/views/gpu_sizes.def
 DEVICE_SIZES = tuple(_C.device_sizes())
+# places of some counts in its `row_sizes`
+ROW_SIZES = _C.row_sizes()

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from .. import _C
 from ..common.checks import tensor_of
-from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, KINDS, PLAN_TABLE, STENCIL_TABLE, PlanRow
+from ..common.tables import DEVICE_PLAN_TABLE, DEVICE_SIZES, KINDS, PLAN_TABLE, ROW_SIZES, STENCIL_TABLE, PlanRow
 from ..scene.scene import SceneValues
 
 __all__ = [
@@ -88,6 +88,14 @@ class Plan:
     def size(self, name: str) -> int:
         """A size of a GPU plan by its name in DEVICE_SIZES."""
         return int(self.sizes[DEVICE_SIZES.index(name)])
+
+    @property
+    def step_entries(self) -> int:
+        """Most entries of forces in a patch of a GPU plan in a step, padding included."""
+        if not any(row.name == "row_sizes" for row in self.table):
+            return self.size("most_entries")
+        rows = self.row_sizes
+        return int(rows[ROW_SIZES["step_entries"]]) if rows[ROW_SIZES["blocks"]] else self.size("most_entries")
 
     @property
     def dtype(self) -> torch.dtype:
@@ -201,12 +209,18 @@ def internal_numbers(vertex_order: NDArray[np.int32]) -> NDArray[np.int32]:
     return internal
 
 
-def stencil_arrays(values: SceneValues) -> list[tuple[int, Index, Reals, Reals, Reals, Index | None]]:
-    """Stencils of a scene as C++ takes them: number of the kind, corners, g_a, measures, constants, tetrahedra."""
+def stencil_arrays(values: SceneValues) -> list[tuple[int, Index, Reals, Reals, Reals, Index | None, bool]]:
+    """Stencils of a scene as C++ takes them.
+
+    Number of the kind, corners, g_a, measures, constants, tetrahedra, and whether the energy is quadratic.
+    """
     return [
-        (list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants, group.tets)
+        (
+            list(KINDS).index(group.kind), group.corners, group.gradients, group.measure, group.constants, group.tets,
+            group.is_quadratic,
+        )
         for group in values.stencils
-    ]
+    ]  # fmt: skip
 
 
 def compile_plan(

@@ -40,7 +40,8 @@ def compile_device_plan(
         progress: show a bar when the mesh is large.
 
     Returns:
-        The arrays of csrc/views/gpu_plan.def in its order, then of gpu_stencils.def if there are any, on the CPU.
+        The arrays of csrc/views/gpu_plan.def in its order, then, with stencils, of gpu_stencils.def and
+        gpu_step_rows.def, on the CPU.
     """
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")

@@ -66,6 +66,7 @@ _STREAM_CONCURRENT = {torch.float32: 2, torch.float64: 1}
 # suffices and each has a patch. Its threads keep the slots in registers (csrc/cuda/stream/pipeline.h).
 _PIPELINE_GROWTH, _PIPELINE_BYTES = 1.2, 200_000
 _TET_ENTRIES = 2.5  # entries of a tetrahedron in shared memory: five of a pair
+_ROW_SHARE = 0.25  # of the corners of quadratic stencils that count as entries when a stream is cut into patches
 _STENCIL_KERNELS = ("block", "stream")
 OTHER_BODIES = "cloth, rods, springs, ties or fibres"  # what has stencils, for errors
 _MAX_PASS_FIELDS = 2  # most fields of one pass: the products with a second derivative
@@ -82,7 +83,7 @@ def check_kernel(kernel: str) -> str:
 def shared_bytes(plan: Plan, planes: int, spheres: int) -> int:
     """Shared memory [bytes] per block of the kernel that a plan is for."""
     real = torch.finfo(plan.dtype).bits // 8
-    slots, entries = plan.size("most_slots"), plan.size("most_entries")
+    slots, entries = plan.size("most_slots"), plan.step_entries
     if plan.for_multilevel:
         return _C.outer_shared_bytes(real, slots, entries)
     if plan.kernel == "stream":
@@ -127,8 +128,13 @@ class _PlanBuilder(NamedTuple):
 
     @property
     def stencil_corners(self) -> int:
-        """Corners of all stencils, each with an entry in shared memory."""
+        """Corners of all stencils, each with an entry in shared memory but for those of quadratic ones in a step."""
         return sum(group.corners.size for group in self.values.stencils)
+
+    @property
+    def row_corners(self) -> int:
+        """Those of quadratic stencils."""
+        return sum(group.corners.size for group in self.values.stencils if group.is_quadratic)
 
     @property
     def vertices(self) -> int:
@@ -168,14 +174,17 @@ class _PlanBuilder(NamedTuple):
                 return max(2, int(least), -(-self.tets // _MANY_TETS))
             rounds = -(-int(least) // gpu.multiprocessors)
             return min(-(-self.tets // _MIN_LEVEL_TETS), rounds * gpu.multiprocessors)
-        # as many entries per patch as tetrahedra would have
-        tets = self.tets + math.ceil(self.stencil_corners / _TET_ENTRIES)
+        # as many entries per patch as tetrahedra would have; of quadratic stencils a share, since only fields have them
+        entries = self.stencil_corners - (1.0 - _ROW_SHARE) * self.row_corners
+        tets = self.tets + math.ceil(entries / _TET_ENTRIES)
         patches = -(-tets // _STREAM_TETS[self.dtype])
         # patches that do not run at once run in whole waves, of which the last is full too
         wave = _STREAM_CONCURRENT[self.dtype] * gpu.multiprocessors
         if self.uses_pipeline(gpu) and patches > gpu.multiprocessors:
             wave = gpu.multiprocessors
             patches = max(wave, math.ceil(tets / (_PIPELINE_GROWTH * _STREAM_TETS[self.dtype])))
+        if self.row_corners > 0 and gpu.multiprocessors < patches < wave:
+            return wave  # the patches of rows are large, so that idle places would show
         return patches if patches <= wave else -(-patches // wave) * wave
 
     def uses_pipeline(self, gpu: Properties) -> bool:
@@ -219,7 +228,7 @@ class _PlanBuilder(NamedTuple):
         slots = self.vertices if patches == 1 else 4
         planes, spheres = len(self.values.planes), len(self.values.spheres)
         # two tetrahedra have at least five entries
-        entries = 5 * tets // 2 + self.stencil_corners // patches
+        entries = 5 * tets // 2 + (self.stencil_corners - self.row_corners) // patches
         least = _C.fused_shared_bytes(self.real, kernel == "grid", slots, entries, planes, spheres)
         return f"at least {least:,} B" if least > gpu.shared else ""
 

@@ -86,7 +86,7 @@ def effect_rows(values: SceneValues) -> dict[str, NDArray[np.float64]]:
     of_tets = {"poisson": values.poisson, "stiffness_damping": values.stiffness_damping}
     found = {name: row for name, row in of_tets.items() if row is not None}
     for group in values.stencils:
-        found |= group.material
+        found |= group.trainable
     return {row.name: found[row.name] for row in MATERIAL_TABLE if row.name in found}
 
 

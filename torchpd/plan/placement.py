@@ -211,6 +211,7 @@ def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.de
     none = np.empty(0, dtype=np.int32)
     levels = plan.level_sizes.numpy() if has_preconditioner(plan.arrays) else none
     stencils = plan.stencil_sizes.numpy() if compiled.has_stencils else none
+    rows = plan.row_sizes.numpy() if compiled.has_stencils else none
     planes, spheres = (compiled.named[name] for name in ("planes", "spheres"))
 
     def own(name: str) -> bool:
@@ -222,7 +223,7 @@ def step_bytes(compiled: CompiledScene, plan: Plan, batch: int, device: torch.de
     schedule: int = compiled.solver.settings()["schedule"]
     with torch.cuda.device(device):
         return _C.step_bytes(
-            real, plan.sizes.numpy(), levels, stencils, schedule, batch, planes.shape[-2], spheres.shape[-2],
+            real, plan.sizes.numpy(), levels, stencils, rows, schedule, batch, planes.shape[-2], spheres.shape[-2],
             tets, effects,
         )  # fmt: skip
 

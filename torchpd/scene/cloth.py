@@ -52,8 +52,8 @@ class Cloth(Body):
             thickness^3 / 12. The scalar 0 leaves bending out. Fabrics bend more easily than that: 1e-6 to 1e-4.
         rest_uv: rest shape in a plane [F, 3, 2] m, by coordinates of each corner of each triangle, as sewing patterns
             have it. None: the rest shape is the surface.
-        rest_curvature: curvature at rest [1/m], a scalar or one value per hinge. 0: flat. "surface": that of the
-            surface, for shells. Such a hinge may bend to either side.
+        rest_curvature: curvature at rest [1/m], a scalar or one value per hinge. 0: flat; a scene of flat hinges alone
+            has no such array to train. "surface": that of the surface, for shells. Such a hinge may bend either way.
         warp: further stiffness along the warp [N/m], a scalar or one value per triangle; or None.
         weft: the same across the warp, along the weft.
         strain_limit: least and largest stretch (lo, hi), or one pair per triangle [F, 2], lo <= 1 <= hi; None: none.

@@ -48,7 +48,7 @@ class Rod(Body):
         bending: flexural rigidity E I [N m^2], a scalar or one value per inner vertex. None: E pi r^4 / 4. The scalar 0
             makes a rope.
         rest_curvature: curvature at rest [1/m], a scalar or one value per inner vertex. "polyline": that of the
-            polyline. A curved vertex may bend in any plane.
+            polyline. A curved vertex may bend in any plane. A scene without any curvature has no such array to train.
 
     Example:
         >>> cable = Rod(np.linspace((0, 1, 0), (1, 1, 0), 21), youngs=1e7, radius=2e-3)

@@ -27,6 +27,7 @@ class Kind(NamedTuple):
     constants: int  # c, further constants of a stencil
     rows: tuple[str, ...]
     of_tets: bool = False  # whether these are rows of tetrahedra, so that the kind has none of its own
+    quadratic: int = 0  # its first rows, which make a quadratic energy where the others are zero; 0: none do
 
     @property
     def own_rows(self) -> tuple[str, ...]:
@@ -37,9 +38,9 @@ class Kind(NamedTuple):
 # In the order in which a scene lists them.
 KINDS: dict[str, Kind] = {
     "triangle": Kind(3, 2, 0, ("membrane_youngs", "membrane_poisson", "thickness")),
-    "hinge": Kind(4, 1, 0, ("bending", "rest_curvature")),
+    "hinge": Kind(4, 1, 0, ("bending", "rest_curvature"), quadratic=1),
     "spring": Kind(2, 1, 0, ("spring_stiffness", "rest_length")),
-    "tie": Kind(5, 1, 0, ("tie_stiffness",)),
+    "tie": Kind(5, 1, 0, ("tie_stiffness",), quadratic=1),
     "fibre": Kind(4, 1, 1, ("fibre_stiffness", "fibre_length")),
     "thread": Kind(3, 1, 0, ("thread_stiffness",)),
     "solid_limit": Kind(4, 3, 0, ("solid_limit",)),
@@ -76,6 +77,18 @@ class StencilGroup:
 
     def __len__(self) -> int:
         return len(self.corners)
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether the energy is w/2 |F|^2 and stays so: rows that would change it are zero, and left out."""
+        count = KINDS[self.kind].quadratic
+        return count > 0 and not any(self.material[name].any() for name in KINDS[self.kind].rows[count:])
+
+    @property
+    def trainable(self) -> dict[str, Array]:
+        """Rows of the material that a simulator has."""
+        count = KINDS[self.kind].quadratic if self.is_quadratic else len(KINDS[self.kind].rows)
+        return {name: self.material[name] for name in KINDS[self.kind].own_rows[:count]}
 
     @staticmethod
     def of(

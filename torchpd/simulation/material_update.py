@@ -141,6 +141,8 @@ def _hint(name: str) -> str:
         return "; every solid has poisson=0.0, which leaves it out: give Solid(poisson=) another number or an array"
     if name == "stiffness_damping":
         return "; every solid has stiffness_damping=0.0, which leaves it out: give Solid(stiffness_damping=)"
+    if name == "rest_curvature":
+        return "; it is 0 in the whole scene, which leaves it out: give a Cloth or a Rod another rest_curvature"
     if name in ("solid_limit", "cloth_limit"):
         part = "solid" if name == "solid_limit" else "cloth"
         return f"; no {part} has a strain_limit, which leaves it out: give {part.title()}(strain_limit=)"

@@ -59,8 +59,24 @@ struct Cuda {
     return call.stencils.blocks > 0;
   }
 
+  // The rows of a plan have no place for an array that the scene lacks.
+  template <class T>
+  static void check_rows([[maybe_unused]] const Step<T>& call) {
+#define KIND(name, type, what)
+#define PARAMETER(kind, array)                                                            \
+  TORCH_CHECK_VALUE(!(call.stencils.rows[row_kinds] >> int(KindNumber::kind) & 1) ||      \
+                        !ArraysOf<TypeOf<KindNumber::kind>>().may_lack(effect_##array) || \
+                        !call.effects.array.data,                                         \
+                    "material." #array                                                    \
+                    " must be empty for the plan of a scene without it; "                 \
+                    "compile a scene that has it");
+#include "elements/kinds.def"
+#undef KIND
+  }
+
   template <class T>
   static void step(const Step<T>& call, const Tensor& like) {
+    check_rows<T>(call);
     const bool stream = call.plan.kernel == int(DeviceKernel::stream);
     if (runs_with_poisson(call)) {
       const Step<T> own = with_poisson(call);

@@ -41,6 +41,8 @@ class Slots {
     first_[slot] = quad(first, second.x);
     behind_[slot] = {second.y, second.z};
   }
+  // leaves the second vector unset
+  PD_DEVICE void set_first(int slot, const Vec3<T>& first) const { first_[slot] = quad(first); }
   // keeps the first vector
   PD_DEVICE void set_second(int slot, const Vec3<T>& second) const {
     first_[slot].w = second.x;

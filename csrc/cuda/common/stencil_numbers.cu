@@ -1,5 +1,6 @@
 #include "cuda/common/stencil_numbers.h"
 
+#include "cuda/common/row_numbers.cuh"
 #include "cuda/common/runtime.h"
 
 namespace pd::inline PD_TARGET {

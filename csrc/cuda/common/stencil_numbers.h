@@ -22,9 +22,23 @@ StencilWork<T> arrange_stencils(Arena& arena, const DeviceStencils<T>& plan,
   return work;
 }
 
+// The same for a step, with the numbers of its rows.
+template <class T>
+StencilWork<T> arrange_step_stencils(Arena& arena, const DeviceStencils<T>& plan,
+                                     const Effects<T>& effects, std::int64_t batch, T per_time) {
+  StencilWork<T> work = arrange_stencils(arena, plan, effects, batch, per_time);
+  if (!plan.has_rows()) return work;
+  work.row_stride = work.stride ? plan.numbers_of_rows() : 0;
+  arena.place(work.rows, (work.stride ? batch : 1) * plan.numbers_of_rows());
+  return work;
+}
+
 template <class T>
 void compute_stencil_numbers(const StencilWork<T>& work, const Effects<T>& effects,
                              std::int64_t batch, cudaStream_t stream);
+// after compute_stencil_numbers
+template <class T>
+void compute_row_numbers(const StencilWork<T>& work, std::int64_t batch, cudaStream_t stream);
 
 // Makes the memory of all stencils from positions [batch, vertices, 3] by the user's numbers, if there is any.
 template <class T>

@@ -20,7 +20,9 @@ struct StencilWork {
   DeviceStencils<T> plan;
   T* numbers = nullptr;     // [batch or 1, rows of 32]
   std::int64_t stride = 0;  // from one environment to the next
-  T per_time = T(0);        // 1 / h, or 0 where energies that dissipate do not count
+  T* rows = nullptr;        // [batch or 1, numbers_of_rows] of a step
+  std::int64_t row_stride = 0;
+  T per_time = T(0);  // 1 / h, or 0 where energies that dissipate do not count
 
   PD_HD T* numbers_of(std::int64_t environment) const { return numbers + environment * stride; }
 };
@@ -136,7 +138,7 @@ PD_DEVICE void each_stencil_block(const DeviceStencils<T>& plan, int patch, int 
   const int warps = int(blockDim.x) / stencil_lanes, warp = int(threadIdx.x) / stencil_lanes;
   int turn = warp - before % warps;
   if (turn < 0) turn += warps;
-  const int end = plan.patch_stencil[patch + 1];
+  const int end = plan.stencil_end[patch];
   int number = plan.patch_stencil[patch] + turn;
   if (number >= end) return;
   StencilBlock now = StencilPlace<T>::block_of(plan, number);
@@ -154,7 +156,7 @@ PD_DEVICE void each_stencil_block(const DeviceStencils<T>& plan, int patch, int 
 template <class T>
 PD_DEVICE void prefetch_stencils(const StencilWork<T>& work, std::int64_t environment, int patch) {
   const DeviceStencils<T>& plan = work.plan;
-  const int first = plan.patch_stencil[patch], last = plan.patch_stencil[patch + 1] - 1;
+  const int first = plan.patch_stencil[patch], last = plan.stencil_end[patch] - 1;
   if (first >= last) return;
   const StencilBlock from = StencilPlace<T>::block_of(plan, first);
   const StencilBlock to = StencilPlace<T>::block_of(plan, last);

@@ -21,7 +21,7 @@ MixedKernel<T> mixed_kernel(const MixedStep<T>& step, bool in_shared) {
                                : mixed_kernel_for<T, false, false>(in_shared);
 }
 
-// Launch configuration of a call. A warp takes 32 pairs of tetrahedra or 32 stencils at a time.
+// Launch configuration of a call. A warp takes 32 pairs of tetrahedra, 32 stencils or 32 rows at a time.
 template <class T>
 struct MixedLaunch {
   static constexpr Blocks kind = Blocks::one;
@@ -32,7 +32,11 @@ struct MixedLaunch {
 
   explicit MixedLaunch(const MixedStep<T>& step) {
     const int pairs = (step.plan.most_pairs + pair_lanes - 1) / pair_lanes * pair_lanes;
-    const BlockForm form(step, pairs + step.stencils.blocks * stencil_lanes);
+    const DeviceStencils<T>& stencils = step.stencils;
+    const int others = stencils.has_rows()
+                           ? stencils.rows[row_step_stencils] + stencils.rows[row_blocks]
+                           : stencils.blocks;
+    const BlockForm form(step, pairs + others * stencil_lanes);
     threads = form.threads;
     kept = form.kept;
     shared = form.shared;
@@ -51,24 +55,27 @@ MixedFusedCall<T> arrange_mixed(Arena& arena, const MixedStep<T>& step,
   const DeviceStep<T>& call = step;
   const FusedScratch<T> scratch = arrange(arena, call, launch);
   return {{call, scratch, launch.teams, launch.kept},
-          arrange_stencils(arena, step.stencils, step.effects, step.batch,
-                           T(1 / step.settings.time_step))};
+          arrange_step_stencils(arena, step.stencils, step.effects, step.batch,
+                                T(1 / step.settings.time_step))};
 }
 
 template <class T>
-std::int64_t mixed_block_bytes(const MixedStep<T>& step) {
+std::int64_t mixed_block_bytes(const MixedStep<T>& given) {
+  const MixedStep<T> step = with_rows(given);
   Arena arena(nullptr);
   arrange_mixed(arena, step, MixedLaunch<T>(step));
   return arena.size();
 }
 
 template <class T>
-void run_mixed_block(const MixedStep<T>& step, void* memory, Stream to) {
+void run_mixed_block(const MixedStep<T>& given, void* memory, Stream to) {
+  const MixedStep<T> step = with_rows(given);
   const auto stream = static_cast<cudaStream_t>(to);
   const MixedLaunch<T> launch(step);
   Arena arena(memory);
   MixedFusedCall<T> call = arrange_mixed(arena, step, launch);
   compute_stencil_numbers(call.stencils, step.effects, step.batch, stream);
+  compute_row_numbers(call.stencils, step.batch, stream);
   void* arguments[] = {&call};
   check(cudaLaunchKernel(launch.function(), dim3(unsigned(launch.teams)), dim3(launch.threads),
                          arguments, launch.shared, stream));

@@ -14,6 +14,7 @@
 #include "cuda/elements/pair_weights.h"
 #include "cuda/elements/pairs_per_thread.h"
 #include "cuda/elements/prefetched_pairs.h"
+#include "cuda/elements/rows.h"
 #include "cuda/elements/stencils.h"
 #include "cuda/elements/tet_per_lane.h"
 #include "cuda/fused/call.h"
@@ -272,7 +273,7 @@ class FusedRunner {
   }
 
   template <class Element>
-  PD_DEVICE T each_element(const Element& element) {
+  PD_DEVICE auto each_element(const Element& element) {
     if constexpr (TetPerLane) {
       const auto shape_of = [&](int number, const TetInputs<T>&, const Quad<T>(&)[4]) {
         return OnePerThread || number == int(threadIdx.x) ? rest_ : tet_rest(patch_, number);
@@ -303,9 +304,13 @@ class FusedRunner {
         x[0] = at_corner(from, corner);
       };
       if constexpr (HasStencils) {
-        return each_pair_and_stencil<1>(patch_, read, rest_of<false>(patch_), weights(),
-                                        stencils_.work, in_.environment, set_.weighted, entries_,
-                                        element);
+        double energy = 0;
+        if (patch_.pairs > 0)
+          energy = double(
+              each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_, element));
+        const int blocks = (patch_.pairs + pair_lanes - 1) / pair_lanes;
+        return energy + each_stencil_of_step(stencils_.work, in_.environment, patch_.index, blocks,
+                                             read, entries_, on_stencils(element, set_.weighted));
       } else {
         return each_pair<1>(patch_, read, rest_of<false>(patch_), weights(), entries_, element);
       }

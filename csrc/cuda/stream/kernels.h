@@ -4,6 +4,7 @@
 #include "cuda/common/reductions.h"
 #include "cuda/common/vertices.h"
 #include "cuda/elements/pair_weights.h"
+#include "cuda/elements/rows.h"
 #include "cuda/elements/stencils.h"
 #include "cuda/elements/tet_per_lane.h"
 #include "cuda/rigid/rounds.h"
@@ -236,7 +237,11 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   auto* entries = reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), w.plan.most_slots, 2));
   for (int s = threadIdx.x; s < patch.slots; s += blockDim.x) {
     const Vec3<T> position = vec3(w.origin[patch.first_slot + s]) + vec3(w.v.u[patch.vertex(s)]);
-    slots.set(s, position, rest.position[s].bits());
+    if (has_tets) {
+      slots.set(s, position, rest.position[s].bits());
+    } else {
+      slots.set_first(s, position);  // only tetrahedra read rest positions
+    }
   }
   __syncthreads();
   const auto shape_of = [&](int, const TetInputs<T>& numbers, const Quad<T>(&loaded)[4]) {
@@ -246,15 +251,15 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   if (has_tets)
     sum = each_tet<false, true>(
         patch, slots, shape_of, [](int, T) { return true; }, w.weights, entries, element, first);
+  double energy = double(sum);
   if constexpr (Stencils::any) {
     const auto read = [slots](unsigned corner, Vec3<T>(&x)[1]) {
       x[0] = vec3(slots.load(corner & 0xffff));
     };
     const int before = (2 * patch.pairs + warp_size - 1) / warp_size;
-    sum += each_stencil<1>(stencils.work, w.environment, number, before, read, entries,
-                           on_stencils(element, stencils.bounded));
+    energy += each_stencil_of_step(stencils.work, w.environment, number, before, read, entries,
+                                   on_stencils(element, stencils.bounded));
   }
-  const double energy = double(sum);
   // loads overlap with the barrier
   int s = threadIdx.x, row = 0;
   decltype(load(0)) loaded{};
@@ -286,7 +291,10 @@ PD_DEVICE void update_patch(const StreamCall<T>& call, int k, std::byte* shared,
   const int number = int(blockIdx.x % call.step.plan.patches);
   const StreamWork<T, HasContacts> w(call, blockIdx.x / call.step.plan.patches);
   if (skips<What>(w)) return;
-  if constexpr (Stencils::any) prefetch_stencils(stencils.work, w.environment, number);
+  if constexpr (Stencils::any) {
+    prefetch_stencils(stencils.work, w.environment, number);
+    prefetch_rows(stencils.work, w.environment, number);
+  }
   // prefetches data that is read after the elements
   const Patch<T> patch(w.plan, number);
   if constexpr (What != Visit::diagonal) {

@@ -322,12 +322,13 @@ void run_stream(const DeviceStep<T>& step, void* memory, Stream to) {
 template <class T>
 StencilWork<T> arrange_mixed(Arena& arena, const MixedStep<T>& step, StreamCall<T>& call) {
   call.memory = arrange(arena, call);
-  return arrange_stencils(arena, step.stencils, step.effects, step.batch,
-                          T(1 / step.settings.time_step));
+  return arrange_step_stencils(arena, step.stencils, step.effects, step.batch,
+                               T(1 / step.settings.time_step));
 }
 
 template <class T>
-std::int64_t mixed_stream_bytes(const MixedStep<T>& step) {
+std::int64_t mixed_stream_bytes(const MixedStep<T>& given) {
+  const MixedStep<T> step = with_rows(given);
   Arena arena(nullptr);
   StreamCall<T> call{step, {}};
   arrange_mixed(arena, step, call);
@@ -335,12 +336,14 @@ std::int64_t mixed_stream_bytes(const MixedStep<T>& step) {
 }
 
 template <class T>
-void run_mixed_stream(const MixedStep<T>& step, void* memory, Stream to) {
+void run_mixed_stream(const MixedStep<T>& given, void* memory, Stream to) {
+  const MixedStep<T> step = with_rows(given);
   const auto stream = static_cast<cudaStream_t>(to);
   StreamCall<T> call{step, {}};
   Arena arena(memory);
   const StencilWork<T> stencils = arrange_mixed(arena, step, call);
   compute_stencil_numbers(stencils, step.effects, step.batch, stream);
+  compute_row_numbers(stencils, step.batch, stream);
   run_stream_with<T>(call, nullptr, &stencils, stream);
 }
 

@@ -3,6 +3,7 @@
 #include "plan/gpu/bank_conflicts.h"
 #include "plan/gpu/ownership.h"
 #include "plan/gpu/patch.h"
+#include "plan/gpu/rows.h"
 #include "plan/gpu/stencil_blocks.h"
 #include "plan/mesh/rest_shape.h"
 #include "threads/team.h"
@@ -316,6 +317,7 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
   DeviceMeshPlan plan;
   number_patches(plan, made, elements.averaged.members, kernel != stream_kernel, fixed);
   number_stencils(plan, elements, made);
+  number_rows(plan, elements, made);
   renumber(mesh.numbering, made);
   plan.vertex_order = mesh.numbering.vertex_order;
   run_team(most_threads(), [&](const Team& team) {
@@ -326,6 +328,7 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
       EntryChoice choice(made[p].first, made[p].forces, made[p].piped);
       fill_blocks(plan, mesh, made[p], int(p), computed ? plan.patch_unit[p] : 1.0, choice);
       fill_stencils(plan, elements, made[p], int(p), choice);
+      fill_rows(plan, elements, made[p], int(p));
     }
   });
   plan.patch_vertex = std::move(mesh.numbering.patch_vertex);
@@ -334,6 +337,8 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
   plan.shared_start = std::move(shared.start);
   plan.shared_slot = std::move(shared.slot);
   mark_owners(plan);
+  for (std::size_t s = 0; s < plan.step_row.size(); ++s)
+    plan.step_row[s] |= plan.slot_row[s] & std::int32_t(0x80000000);
   if (kernel == grid_kernel) link_slots(plan);
   if (kernel == stream_kernel) place_forces(plan);
   if (kernel == cluster_kernel) link_copies(plan);

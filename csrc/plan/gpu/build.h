@@ -1,5 +1,5 @@
-// Compiles the elements of a scene into the arrays of views/gpu_plan.def and views/gpu_stencils.def: patches, pairs,
-// stencils, gather lists and rest shapes.
+// Compiles the elements of a scene into the arrays of views/gpu_plan.def, gpu_stencils.def and gpu_step_rows.def: patches,
+// pairs, stencils, rows, gather lists and rest shapes.
 #pragma once
 
 #include "plan/mesh/elements.h"
@@ -18,6 +18,7 @@ struct DeviceMeshPlan {
 #define X(name, type, width, rows, meaning) std::vector<type> name;
 #include "views/gpu_plan.def"
 #include "views/gpu_stencils.def"
+#include "views/gpu_step_rows.def"
 #undef X
 };
 

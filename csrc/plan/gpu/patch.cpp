@@ -1,6 +1,7 @@
 #include "plan/gpu/patch.h"
 
 #include "plan/gpu/bank_conflicts.h"
+#include "plan/gpu/rows.h"
 #include "threads/team.h"
 #include "views/shared_memory.h"
 
@@ -52,19 +53,6 @@ void scatter(std::vector<T>& items, const std::vector<std::int32_t>& place) {
   items = std::move(moved);
 }
 
-// Every slice of eight slots reserves as many entries as its slot with the most forces.
-void count_entries(MeshPatch& patch) {
-  patch.first.resize(patch.forces.size());
-  SliceBanks banks;
-  for (std::size_t s = 0; s < patch.forces.size(); s += slice) {
-    const std::size_t end = std::min(s + slice, patch.forces.size());
-    if (patch.piped) patch.entries = banks.next(patch.entries);
-    for (std::size_t i = s; i < end; ++i) patch.first[i] = std::int32_t(patch.entries + i - s);
-    patch.entries += slice * *std::max_element(patch.forces.begin() + std::ptrdiff_t(s),
-                                               patch.forces.begin() + std::ptrdiff_t(end));
-  }
-}
-
 // Minimises bank conflicts. In a patch that is not small, pairs that touch shared vertices come in
 // the first blocks.
 void order_pairs(MeshPatch& patch, int number, const Numbering& numbering) {
@@ -103,6 +91,9 @@ void add_stencils(MeshPatch& patch, const MeshElements& all, std::span<const std
     }
     if (!own.number.empty()) patch.stencils.push_back(std::move(own));
   }
+  // a step takes the others as rows
+  std::stable_partition(patch.stencils.begin(), patch.stencils.end(),
+                        [&](const PatchStencils& own) { return !all.groups[own.group].quadratic; });
 }
 
 // `number` [vertices] is -1 before and after the call.
@@ -156,11 +147,24 @@ MeshPatch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& num
   order_pairs(patch, index, mesh.numbering);
   patch.piped = mesh.kernel == stream_kernel && mesh.elements.groups.empty() &&
                 std::ssize(patch.vertex) <= pipeline_slots;
-  count_entries(patch);
+  patch.place(patch.piped);
+  if (has_rows(mesh.elements)) make_rows(patch, mesh.elements);
   return patch;
 }
 
 }  // namespace
+
+void Entries::place(bool piped) {
+  first.resize(forces.size());
+  SliceBanks banks;
+  for (std::size_t s = 0; s < forces.size(); s += slice) {
+    const std::size_t end = std::min(s + slice, forces.size());
+    if (piped) entries = banks.next(entries);
+    for (std::size_t i = s; i < end; ++i) first[i] = std::int32_t(entries + i - s);
+    entries += slice * *std::max_element(forces.begin() + std::ptrdiff_t(s),
+                                         forces.begin() + std::ptrdiff_t(end));
+  }
+}
 
 std::vector<MeshPatch> make_patches(const Mesh& mesh, std::int64_t vertices) {
   const Partition& partition = mesh.partition;

@@ -42,16 +42,34 @@ struct PatchStencils {
   std::int64_t blocks() const { return (std::ssize(number) + lanes - 1) / lanes; }
 };
 
-// A patch in local numbers.
-struct MeshPatch {
-  std::vector<std::int32_t> vertex;  // user's vertex of each slot
-  std::vector<std::int32_t> first;   // first entry of each slot
+// The entries of a patch.
+struct Entries {
+  std::vector<std::int32_t> first;   // of each slot
   std::vector<std::int32_t> forces;  // entries that each slot sums
+  std::int64_t entries = 0;
+
+  // Every slice of eight slots reserves as many entries as its slot with the most forces.
+  void place(bool piped);
+};
+
+// The rows of the quadratic stencils in a patch, see views/gpu_step_rows.def. A term counts stencils from the patch's first.
+struct PatchRows {
+  std::vector<std::int32_t> slot;         // of each row, 32 in a block; -1: padding
+  std::vector<std::int32_t> width;        // pairs of neighbours of each block
+  std::vector<std::int32_t> neighbour;    // row_neighbour
+  std::vector<std::int32_t> count, term;  // terms of each t
+  std::vector<std::int32_t> diagonal_count, diagonal_term;  // and of each diagonal
+};
+
+// A patch in local numbers.
+struct MeshPatch : Entries {
+  std::vector<std::int32_t> vertex;  // user's vertex of each slot
   std::vector<Pair> pairs;           // user's tetrahedra; corners are slots
   std::vector<PatchStencils> stencils;
   std::int64_t outer = 0;    // number of leading pairs that may touch shared vertices
   std::int64_t coupled = 0;  // number of leading pairs that average with their neighbour
-  std::int64_t entries = 0;
+  Entries step;              // with rows: those of a step
+  PatchRows rows;
   bool piped = false;  // whether cuda/stream/pipeline.h reads and writes the entries
 
   std::int64_t blocks() const { return (std::ssize(pairs) + lanes - 1) / lanes; }

@@ -18,6 +18,7 @@ struct StencilGroup {
   const double* constant = nullptr;      // [count, constants]
   const std::int64_t* row = nullptr;     // [count] of the material; null: their own numbers
   bool large = false;                    // see elements/stencil.h
+  bool quadratic = false;                // whether their energy is p[0] / 2 |F|^2
 };
 
 // Tetrahedra in groups that average their trace, see elements/corotated.h: a partition never cuts one.

@@ -44,6 +44,23 @@ def free_sheet() -> Case:
     )
 
 
+def flat_case() -> Case:
+    """Cloth held at an edge whose bending differs from hinge to hinge, without a curvature at rest."""
+    mesh = surface(size=(0.6, 0.5), cells=(9, 8))
+    count = len(cloth(mesh, bending=1.0).bending)
+    body = cloth(mesh, bending=np.linspace(1e-4, 3e-3, count), poisson=0.2)
+    return _case(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity((1.0, -9.8, 0.5)))
+
+
+def tied_case() -> Case:
+    """Two sheets with hinges that are curved at rest, tied together: only the ties are quadratic."""
+    mesh = surface(size=(0.6, 0.5), cells=(6, 5))
+    body = cloth(mesh, bending=1e-4, rest_curvature=0.5)
+    other = cloth(mesh.translated((0.03, 0.0, 0.02)), bending=1e-4)
+    ties = pd.Tie(other, [0, 7, 20, 30], body, stiffness=np.array([40.0, 80.0, 20.0, 60.0]))
+    return _case(body, other, ties, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+
+
 def rod_case() -> Case:
     """A rod: springs and hinges of three vertices."""
     angle = np.linspace(0.0, 1.5, 14)
@@ -91,6 +108,8 @@ def mixed_case(*parts: object, **options: Any) -> Case:
 CASES: dict[str, Callable[[], Case]] = {
     "sheet": sheet_case,
     "free sheet": free_sheet,
+    "flat sheet": flat_case,
+    "ties": tied_case,
     "rod": rod_case,
     "springs": spring_case,
     "fibres": fibre_case,
