@@ -70,20 +70,22 @@ struct KindShape {
   std::vector<std::string> rows;
   const char* meaning;
   bool on_gpu;  // whether a GPU has kernels for it
+  bool keeps_axes;
 };
 
 std::vector<KindShape> kind_shapes() {
   std::vector<KindShape> kinds;
-#define KIND(name, type, what)               \
-  kinds.push_back({#name,                    \
-                   pd::type::corners,        \
-                   pd::type::dims,           \
-                   pd::type::constants,      \
-                   pd::type::numbers,        \
-                   pd::reads_tets<pd::type>, \
-                   {},                       \
-                   what,                     \
-                   pd::runs_on_gpu<pd::type>});
+#define KIND(name, type, what)                \
+  kinds.push_back({#name,                     \
+                   pd::type::corners,         \
+                   pd::type::dims,            \
+                   pd::type::constants,       \
+                   pd::type::numbers,         \
+                   pd::reads_tets<pd::type>,  \
+                   {},                        \
+                   what,                      \
+                   pd::runs_on_gpu<pd::type>, \
+                   pd::keeps_axes<pd::type>});
 #define PARAMETER(name, array) kinds.back().rows.push_back(#array);
 #include "elements/kinds.def"
 #undef KIND
@@ -138,6 +140,7 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std
           shape.dims,
           shape.constants,
           shape.numbers,
+          shape.keeps_axes,
           count,
           corner.data(),
           gradient.data(),
@@ -338,9 +341,11 @@ py::list table(std::span<const TableRow> rows) {
 py::list material_table() {
   py::list rows;
 #define X(name, width, rows_, meaning) \
-  rows.append(py::make_tuple(#name, width, #rows_, meaning, false));
+  rows.append(py::make_tuple(#name, width, #rows_, meaning, false, false));
 #define EFFECT(name, width, rows_, meaning) \
-  rows.append(py::make_tuple(#name, width, #rows_, meaning, true));
+  rows.append(py::make_tuple(#name, width, #rows_, meaning, true, false));
+#define HISTORY(name, width, rows_, meaning) \
+  rows.append(py::make_tuple(#name, width, #rows_, meaning, true, true));
 #include "views/material.def"
 #undef X
   return rows;

@@ -29,14 +29,17 @@ PD_HD R trace_strain(const Mat3<R>& f, const Mat3<R>& strain) {
 // Average over a group, with the weights V lambda; zero where none has any.
 template <class R, int Members>
 PD_HD R group_average(const R (&value)[Members], const R (&pressure)[Members]) {
-  if constexpr (Members == 1) return value[0];
-  R sum = pressure[0], product = pressure[0] * value[0];
-  for (int m = 1; m < Members; ++m) {
-    sum = sum + pressure[m];
-    product = multiply_add(pressure[m], value[m], product);
+  if constexpr (Members == 1) {
+    return value[0];
+  } else {
+    R sum = pressure[0], product = pressure[0] * value[0];
+    for (int m = 1; m < Members; ++m) {
+      sum = sum + pressure[m];
+      product = multiply_add(pressure[m], value[m], product);
+    }
+    using T = scalar_of<R>;
+    return product * reciprocal(select(lesser(sum, -sum) < R(T(0)), sum, R(T(1))));
   }
-  using T = scalar_of<R>;
-  return product * reciprocal(select(lesser(sum, -sum) < R(T(0)), sum, R(T(1))));
 }
 
 // phi of a group and its derivatives at the group's t

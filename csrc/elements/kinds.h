@@ -116,9 +116,13 @@ struct ArraysOf {
 template <class Kind>
 constexpr bool reads_tets = ArraysOf<Kind>().of_tets;
 
+// The array of the material that holds the history of a kind.
+template <class Kind>
+constexpr int history_effect = ArraysOf<Kind>().effect[array_count<Kind> - 1];
+
 // Whether a GPU has kernels for a kind: none that depends on the start of a step or reads arrays of tetrahedra, yet.
 template <class Kind>
-constexpr bool runs_on_gpu = memory_of<Kind> == 0 && !reads_tets<Kind> &&
+constexpr bool runs_on_gpu = memory_of<Kind> == 0 && history_of<Kind> == 0 && !reads_tets<Kind> &&
                              ArraysOf<Kind>().first[array_count<Kind>] == array_count<Kind>;
 
 // The rows of those arrays in one environment. An array of tetrahedra that the scene lacks has zeros.

@@ -10,12 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..common.tables import MATERIAL_TABLE, PLANES, SPHERES, MaterialRow
+from ..common.tables import HISTORY_ROWS, MATERIAL_TABLE, PLANES, SPHERES, MaterialRow
 from ..scene.pins import PIN_HARD, hold_exactly, split_springs
 from ..scene.scene import SceneValues
 
 __all__ = [
     "CORE_ROWS",
+    "HISTORY_PLACES",
     "LOAD_ROWS",
     "MATERIAL_ROWS",
     "SCENE_NAME_HINTS",
@@ -44,6 +45,7 @@ LOAD_ROWS = (
 )
 MATERIAL_ROWS = {row.name: row for row in (*MATERIAL_TABLE, *LOAD_ROWS)}
 CORE_ROWS = tuple(row.name for row in MATERIAL_TABLE if not row.effect)  # arrays that every scene has
+HISTORY_PLACES = tuple(MATERIAL_TABLE.index(row) for row in HISTORY_ROWS)  # in the material of the ops
 # hints for names of scene arguments given to `set_material`
 SCENE_NAME_HINTS = {
     "activation": "it is an input of steps, targets={fibres: activation}; fibre_length is 1 - contraction activation",
