@@ -4,6 +4,7 @@
 #include "elements/damper.h"
 #include "elements/fibre.h"
 #include "elements/hinge.h"
+#include "elements/plastic.h"
 #include "elements/solid_limit.h"
 #include "elements/spring.h"
 #include "elements/thread.h"

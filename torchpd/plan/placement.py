@@ -110,8 +110,9 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
     lacking = [group.kind for group in values.stencils if not KINDS[group.kind].on_gpu]
     if lacking:
         raise RuntimeError(
-            "Simulator: device must be the CPU for scenes with strain limits, the volume law or stiffness-proportional "
-            f"damping ({', '.join(lacking)}), which have no kernels for {device}; keep it there, or leave these out"
+            "Simulator: device must be the CPU for scenes with strain limits, the volume law, stiffness-proportional "
+            f"damping or plastic solids ({', '.join(lacking)}), which have no kernels for {device}; keep it there, or "
+            "leave these out"
         )
     return choose_plan(
         values, dtype, properties_of(device), compiled.kernel,
