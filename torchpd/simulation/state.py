@@ -93,25 +93,27 @@ class HistoryState(NamedTuple):
 
 
 _AnyState = TypeVar("_AnyState", State, HistoryState)
+_Some = TypeVar("_Some", bound=State | HistoryState)
 
 
-def _mapped(state: _AnyState, function: Callable[[Tensor], Tensor]) -> _AnyState:
+def _mapped(state: _Some, function: Callable[[Tensor], Tensor]) -> _Some:
     """The state with a function applied to each of its tensors."""
-    parts = (function(part) if isinstance(part, Tensor) else History(*map(function, part)) for part in state)
-    return type(state)(*parts)
+    whole: tuple[Any, ...] = state
+    kind: Callable[..., _Some] = type(state)
+    return kind(*(function(part) if isinstance(part, Tensor) else History(*map(function, part)) for part in whole))
 
 
 def _dense_copy(tensor: Tensor) -> Tensor:
     return tensor.clone(memory_format=torch.contiguous_format)
 
 
-def _named(state: _AnyState) -> dict[str, Tensor]:
+def _named(state: State | HistoryState) -> dict[str, Tensor]:
     """The tensors of a state by name."""
     named = {"positions": state.positions, "velocities": state.velocities}
     return named | state.history._asdict() if isinstance(state, HistoryState) else named
 
 
-def _where(state: _AnyState, condition: Tensor, other: _AnyState) -> _AnyState:
+def _where(state: _Some, condition: Any, other: Any) -> _Some:
     """Implementation of `State.where` and `HistoryState.where`."""
     kind = type(state)
     if not isinstance(condition, Tensor):
@@ -123,8 +125,7 @@ def _where(state: _AnyState, condition: Tensor, other: _AnyState) -> _AnyState:
         )
     if not isinstance(other, (tuple, list)) or len(other) != len(state):
         raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__}, got {type(other).__name__}")
-    other = kind(*other)
-    theirs_of = _named(other)
+    theirs_of = _named(kind(*other))
     for name, mine in _named(state).items():
         theirs = theirs_of[name]
         if theirs.dtype != mine.dtype or theirs.device != mine.device:
