@@ -16,12 +16,13 @@ from .scene.cloth import Cloth
 from .scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .scene.fibres import Fibres
 from .scene.loads import Pressure, Wind
+from .scene.plastic import Plastic
 from .scene.rod import Rod
 from .scene.scene import Scene
 from .scene.solvers import Chebyshev, Jacobi, Multilevel
 from .scene.springs import Springs
 from .scene.tie import Tie
-from .simulation.state import Info, State, Track
+from .simulation.state import History, HistoryState, HistoryTrack, Info, State, Track
 from .version import __version__
 
 if load_extension()[0] is not None:
@@ -58,6 +59,9 @@ __all__ = [
     "FreeFormPatches",
     "Gravity",
     "Ground",
+    "History",
+    "HistoryState",
+    "HistoryTrack",
     "Info",
     "Jacobi",
     "MembraneStress",
@@ -74,6 +78,7 @@ __all__ = [
     "PatchTransport",
     "Pin",
     "Plan",
+    "Plastic",
     "Pressure",
     "QuadricTransport",
     "Quadrics",

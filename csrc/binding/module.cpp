@@ -72,21 +72,25 @@ struct KindShape {
   const char* meaning;
   bool large;     // see elements/stencil.h
   int quadratic;  // arrays that make its energy quadratic; 0: none do
+  bool on_gpu;    // whether a GPU has kernels for it
+  bool keeps_axes;
 };
 
 std::vector<KindShape> kind_shapes() {
   std::vector<KindShape> kinds;
-#define KIND(name, type, what)               \
-  kinds.push_back({#name,                    \
-                   pd::type::corners,        \
-                   pd::type::dims,           \
-                   pd::type::constants,      \
-                   pd::type::numbers,        \
-                   pd::reads_tets<pd::type>, \
-                   {},                       \
-                   what,                     \
-                   pd::is_large<pd::type>,   \
-                   pd::quadratic_arrays<pd::type>});
+#define KIND(name, type, what)                     \
+  kinds.push_back({#name,                          \
+                   pd::type::corners,              \
+                   pd::type::dims,                 \
+                   pd::type::constants,            \
+                   pd::type::numbers,              \
+                   pd::reads_tets<pd::type>,       \
+                   {},                             \
+                   what,                           \
+                   pd::is_large<pd::type>,         \
+                   pd::quadratic_arrays<pd::type>, \
+                   pd::runs_on_gpu<pd::type>,      \
+                   pd::keeps_axes<pd::type>});
 #define PARAMETER(name, array) kinds.back().rows.push_back(#array);
 #include "elements/kinds.def"
 #undef KIND
@@ -143,6 +147,7 @@ pd::StencilGroup stencil_group(const Stencils& given, std::int64_t vertices, std
           shape.dims,
           shape.constants,
           shape.numbers,
+          shape.keeps_axes,
           count,
           corner.data(),
           gradient.data(),
@@ -349,9 +354,11 @@ py::list table(std::span<const TableRow> rows) {
 py::list material_table() {
   py::list rows;
 #define X(name, width, rows_, meaning) \
-  rows.append(py::make_tuple(#name, width, #rows_, meaning, false));
+  rows.append(py::make_tuple(#name, width, #rows_, meaning, false, false));
 #define EFFECT(name, width, rows_, meaning) \
-  rows.append(py::make_tuple(#name, width, #rows_, meaning, true));
+  rows.append(py::make_tuple(#name, width, #rows_, meaning, true, false));
+#define HISTORY(name, width, rows_, meaning) \
+  rows.append(py::make_tuple(#name, width, #rows_, meaning, true, true));
 #include "views/material.def"
 #undef X
   return rows;
@@ -381,7 +388,8 @@ py::list kind_table() {
   py::list rows;
   for (const KindShape& kind : kind_shapes())
     rows.append(py::make_tuple(kind.name, kind.corners, kind.dims, kind.constants,
-                               py::tuple(py::cast(kind.rows)), kind.meaning, kind.quadratic));
+                               py::tuple(py::cast(kind.rows)), kind.meaning, kind.quadratic,
+                               kind.on_gpu));
   return rows;
 }
 
@@ -501,7 +509,7 @@ PYBIND11_MODULE(_C, m) {
       "stencil_table", [] { return table(stencil_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays of stencils, in op order.");
   m.def("kind_table", &kind_table,
-        "Rows (name, corners, dims, constants, arrays, meaning, quadratic) of the kinds of "
+        "Rows (name, corners, dims, constants, arrays, meaning, quadratic, on GPU) of the kinds of "
         "stencils.");
   m.def(
       "multilevel_table", [] { return table(multilevel_rows); },

@@ -1,6 +1,7 @@
 // The ops: schemas, and their CPU implementation.
 #include "binding/rollout_adjoint.h"
 
+#include "binding/history_ops.h"
 #include "binding/plan_views.h"
 #include "cpu/dispatch.h"
 
@@ -156,6 +157,12 @@ TORCH_LIBRARY(torchpd, m) {
   with_plan(
       "damping_vjp(Tensor positions, Tensor start, Tensor direction, Tensor[] material, Tensor[] "
       "plan, *, float time_step) -> Tensor[]");
+  with_plan(
+      "next_history(Tensor positions, Tensor[] material, Tensor[] plan, *, float time_step) -> "
+      "Tensor[]");
+  with_plan(
+      "next_history_vjp(Tensor[] gradients, Tensor positions, Tensor[] material, Tensor[] plan, *, "
+      "float time_step) -> Tensor[]");
   // with a time step also that of the energies that a step dissipates
   with_plan(
       "elastic_diagonal(Tensor[] material, Tensor[] plan, *, bool weighted, float time_step=0.0) "
@@ -212,6 +219,7 @@ TORCH_LIBRARY(torchpd, m) {
 TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
   register_ops<Cpu>(m);
   register_adjoint_ops<Cpu>(m);
+  register_history_ops<Cpu>(m);
 }
 
 }  // namespace pd

@@ -137,6 +137,9 @@ Outputs rollout(const Numbers& n, const Tensor& positions, const Tensor& velocit
                 const OptionalTensor& forces, at::TensorList material, at::TensorList plan,
                 std::int64_t steps, std::int64_t every) {
   check_positions(positions, "positions");
+  TORCH_CHECK_VALUE(!has_history(material),
+                    "rollout must have no plastic solids, whose flow changes after every step, got "
+                    "some; call step and then next_history, step by step");
   const Settings settings = settings_of(n, false, steps, every);
   const std::int64_t records = steps / every;
   const Tensor x =
@@ -149,8 +152,9 @@ Outputs rollout(const Numbers& n, const Tensor& positions, const Tensor& velocit
 
 // The step that a field belongs to: energies that it dissipates count, with the positions at its start.
 struct StepOfField {
-  double time_step = 0;  // none
-  Tensor start = {};     // undefined: `positions` are those at the start
+  double time_step = 0;                        // none
+  Tensor start = {};                           // undefined: `positions` are those at the start
+  std::vector<Tensor> history_gradients = {};  // by EffectNumber, undefined where there are none
 
   template <class T>
   T per_time() const {
@@ -183,6 +187,10 @@ void field_typed(Field field, const Tensor& positions, const Tensor& direction,
   call.effects.stiffness = call.stiffness;
   for (std::size_t i = 0; i < products.size(); ++i) {
     if (products[i].numel() > 0) call.products[i] = products[i].template mutable_data_ptr<T>();
+  }
+  for (std::size_t i = 0; i < step.history_gradients.size(); ++i) {
+    const Tensor& given = step.history_gradients[i];
+    if (given.defined()) call.history_gradients[i] = given.template const_data_ptr<T>();
   }
   call.positions = x.const_data_ptr<T>();
   call.direction = d.defined() ? d.const_data_ptr<T>() : nullptr;
@@ -238,7 +246,8 @@ constexpr std::size_t poisson_product = 1 + place_in_material("poisson") - mater
 template <class Backend>
 std::vector<Tensor> stencil_products(Field field, const Tensor& positions, const Tensor& along,
                                      at::TensorList material, at::TensorList plan,
-                                     const StepOfField& step = {}) {
+                                     const StepOfField& step = {},
+                                     const Tensor& by_positions = {}) {
   std::vector<Tensor> products;
   const auto add = [&](std::size_t place, int width) {
     std::vector<std::int64_t> shape =
@@ -255,7 +264,7 @@ std::vector<Tensor> stencil_products(Field field, const Tensor& positions, const
   if (material.size() > material_arrays) add(place_in_material(#name), width);
 #include "views/material.def"
 #undef X
-  const Tensor out = at::empty({0}, positions.options());
+  const Tensor out = by_positions.defined() ? by_positions : at::empty({0}, positions.options());
   if (positions.scalar_type() == at::kFloat) {
     field_typed<Backend, float>(field, positions, along, material, plan, out, {}, products, step);
   } else {

@@ -525,6 +525,18 @@ inline bool has_damping(at::TensorList material) {
   return material.size() > material_arrays && array_of(material, "stiffness_damping").size(-1) > 0;
 }
 
+// Whether a step leaves something for the next one.
+inline bool has_history(at::TensorList material) {
+  bool found = false;
+#define X(name, width, rows, meaning)
+#define EFFECT(name, width, rows, meaning)
+#define HISTORY(name, width, rows, meaning) \
+  found = found || (material.size() > material_arrays && array_of(material, #name).numel() > 0);
+#include "views/material.def"
+#undef X
+  return found;
+}
+
 // Whether a material has Poisson's ratio.
 inline bool has_poisson(at::TensorList material) {
   return material.size() > material_arrays && array_of(material, "poisson").size(-1) > 0;

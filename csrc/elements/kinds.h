@@ -4,6 +4,7 @@
 #include "elements/damper.h"
 #include "elements/fibre.h"
 #include "elements/hinge.h"
+#include "elements/plastic.h"
 #include "elements/solid_limit.h"
 #include "elements/spring.h"
 #include "elements/thread.h"
@@ -132,6 +133,14 @@ bool any_kind(const int32* counts, const Holds& holds) {
     with_kind(number, [&](auto kind) { found = found || (counts[number] > 0 && holds(kind)); });
   return found;
 }
+
+// The array of the material that holds the history of a kind.
+template <class Kind>
+constexpr int history_effect = ArraysOf<Kind>().effect[array_count<Kind> - 1];
+
+// Whether a GPU has kernels for a kind: none that keeps a history, yet.
+template <class Kind>
+constexpr bool runs_on_gpu = history_of<Kind> == 0;
 
 // The counts of a plan's stencils and of their rows, from their arrays of sizes; without the other arrays.
 template <class T>

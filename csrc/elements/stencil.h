@@ -25,18 +25,39 @@
 //   dissipates                   true: psi is an energy times time, which a step divides by h; no elastic energy
 // and
 //   large                        true: it takes many registers. On a GPU only the kernels of cuda/poisson have it
+// A kind may keep a history from step to step, its last array of the material, which no simulator trains:
+//   history                      how many numbers
+//   finish(f, row, h, next)      the next history, from F at the end of a step of h; with dual numbers its derivative
+// Where psi is an energy of F A with a matrix A that the numbers p give, as after plastic flow, d = 3:
+//   keeps_axes                   true: the vectors g_a are stored in the axes of the rest shape
+//   metric(p)                    A; the majoriser then has A^T g_a in place of g_a
+// A kind that stands for a whole tetrahedron has
+//   inverts                      true: det F <= 0 counts as inverted
 #pragma once
 #include "math/dual.h"
+#include "math/stretch.h"
 #include "math/vec.h"
 #include "views/views.h"
 
 namespace pd::inline PD_TARGET {
 
-// Numbers that store the vectors g_a. A rotation of R^d, which changes no energy, makes column j of F a combination of
-// the first n - d + j edges x_a - x_0 alone.
 template <class Kind>
-constexpr int gradient_numbers =
-    Kind::dims * (Kind::corners - Kind::dims) + Kind::dims * (Kind::dims - 1) / 2;
+constexpr bool keeps_axes = false;
+template <class Kind>
+  requires requires { Kind::keeps_axes; }
+constexpr bool keeps_axes<Kind> = Kind::keeps_axes;
+
+// Edges x_a - x_0 that make up column j of F. A rotation of R^d, which changes no energy, leaves the first n - d + j
+// alone.
+template <class Kind>
+PD_HD constexpr int column_edges(int j) {
+  return Kind::corners - (keeps_axes<Kind> ? 1 : Kind::dims - j);
+}
+// Numbers that store the vectors g_a.
+template <class Kind>
+constexpr int gradient_numbers = keeps_axes<Kind> ? Kind::dims * (Kind::corners - 1)
+                                                  : Kind::dims * (Kind::corners - Kind::dims) +
+                                                        Kind::dims * (Kind::dims - 1) / 2;
 template <class Kind>
 constexpr int stored_numbers = gradient_numbers<Kind> + Kind::constants;
 // an array may not be empty
@@ -60,6 +81,16 @@ constexpr bool dissipates = false;
 template <class Kind>
   requires requires { Kind::dissipates; }
 constexpr bool dissipates<Kind> = Kind::dissipates;
+template <class Kind>
+constexpr int history_of = 0;
+template <class Kind>
+  requires requires { Kind::history; }
+constexpr int history_of<Kind> = Kind::history;
+template <class Kind>
+constexpr bool inverts = false;
+template <class Kind>
+  requires requires { Kind::inverts; }
+constexpr bool inverts<Kind> = Kind::inverts;
 
 template <class Kind>
 constexpr bool is_large = false;
@@ -86,7 +117,7 @@ PD_HD void deform(const Vec3<R> (&x)[Kind::corners], const Stored& g, Vec3<R> (&
   for (int a = 0; a < n - 1; ++a) edge[a] = x[a + 1] - x[0];
   int at = 0;
   for (int j = 0; j < d; ++j) {
-    for (int a = 0; a < n - d + j; ++a, ++at)
+    for (int a = 0; a < column_edges<Kind>(j); ++a, ++at)
       f[j] = a == 0 ? R(g[at]) * edge[a] : multiply_add(R(g[at]), edge[a], f[j]);
   }
 }
@@ -98,8 +129,8 @@ PD_HD void stencil_forces(const Vec3<R> (&p)[Kind::dims], const Stored& g,
   constexpr int n = Kind::corners, d = Kind::dims;
   int at = 0;
   for (int j = 0; j < d; ++j) {
-    for (int a = 0; a < n - d + j; ++a, ++at) {
-      const bool first = j == 0 || a == n - d + j - 1;
+    for (int a = 0; a < column_edges<Kind>(j); ++a, ++at) {
+      const bool first = j == 0 || (!keeps_axes<Kind> && a == column_edges<Kind>(j) - 1);
       force[a + 1] = first ? R(g[at]) * p[j] : multiply_add(R(g[at]), p[j], force[a + 1]);
     }
   }
@@ -119,6 +150,42 @@ PD_HD void gradient_squares(const R (&g)[gradient_numbers<Kind>], R (&square)[Ki
     for (int i = 0; i < d; ++i) axes[i] = {i == j ? one : none, none, none};
     stencil_forces<Kind>(axes, g, force);
     for (int a = 0; a < n; ++a) square[a] = multiply_add(force[a].x, force[a].x, square[a]);
+  }
+}
+
+// |A^T g_a|^2 of every corner, and l_e of these vectors in place of `bound`
+template <class Kind, class R>
+PD_HD void metric_squares(const R (&g)[gradient_numbers<Kind>], const Mat3<R>& metric,
+                          R (&square)[Kind::corners], R& bound) {
+  constexpr int n = Kind::corners;
+  const R none(scalar_of<R>(0)), one(scalar_of<R>(1));
+  Vec3<R> axes[3], force[n], own[n];
+  for (int j = 0; j < 3; ++j) {
+    for (int i = 0; i < 3; ++i) axes[i] = {i == j ? one : none, none, none};
+    stencil_forces<Kind>(axes, g, force);
+    for (int a = 0; a < n; ++a)
+      own[a] =
+          j == 0 ? force[a].x * metric.row[0] : multiply_add(force[a].x, metric.row[j], own[a]);
+  }
+  Mat3<R> sum = {{{none, none, none}, {none, none, none}, {none, none, none}}};
+  for (int a = 0; a < n; ++a) {
+    square[a] = dot(own[a], own[a]);
+    const Vec3<R> unit = (one / select(none < square[a], square[a], one)) * own[a];
+    sum.row[0] = multiply_add(unit.x, own[a], sum.row[0]);
+    sum.row[1] = multiply_add(unit.y, own[a], sum.row[1]);
+    sum.row[2] = multiply_add(unit.z, own[a], sum.row[2]);
+  }
+  bound = largest_eigenvalue(sum);
+}
+
+// |g_a|^2 and l_e as the majoriser takes them; `bound`: l_e of the rest shape
+template <class Kind, class R>
+PD_HD void majoriser_squares(const R (&g)[gradient_numbers<Kind>], const R (&p)[Kind::numbers],
+                             R (&square)[Kind::corners], R& bound) {
+  if constexpr (requires { Kind::metric(p); }) {
+    metric_squares<Kind>(g, Kind::metric(p), square, bound);
+  } else {
+    gradient_squares<Kind>(g, square);
   }
 }
 
@@ -253,6 +320,22 @@ struct StencilStartSlope {
   }
 };
 
+// Forces of the stress that stands in place of the first numbers of a stencil which keeps a history.
+struct StencilStored {
+  template <class Kind, class Stencils>
+  PD_HD void run(const Stencils& stencils) const {
+    if constexpr (history_of<Kind> > 0) {
+      using R = typename Stencils::R;
+      static_assert(3 * Kind::dims <= Kind::numbers);
+      const StencilNumbers<Kind, Stencils> s(stencils);
+      Vec3<R> x[Kind::corners], p[Kind::dims];
+      for (int j = 0; j < Kind::dims; ++j) p[j] = {s.p[3 * j], s.p[3 * j + 1], s.p[3 * j + 2]};
+      stencil_forces<Kind>(p, s.g, x);
+      stencils.add(x);
+    }
+  }
+};
+
 // Makes the memory, from the positions at the start of the step, which are field 0.
 struct StencilBegin {
   template <class Kind, class Stencils>
@@ -303,10 +386,13 @@ struct StencilDiagonal {
     using R = typename Stencils::R;
     const StencilNumbers<Kind, Stencils> s(stencils);
     const R none(scalar_of<R>(0)), one(scalar_of<R>(1)), corners{scalar_of<R>(Kind::corners)};
-    const R weight =
-        bounded ? Kind::weight(s.p, stencils.bound(), corners) : rest_weight<Kind>(s.p);
-    R square[Kind::corners];
-    gradient_squares<Kind>(s.g, square);
+    R square[Kind::corners], bound = stencils.bound();
+    if (bounded) {
+      majoriser_squares<Kind>(s.g, s.p, square, bound);
+    } else {
+      gradient_squares<Kind>(s.g, square);
+    }
+    const R weight = bounded ? Kind::weight(s.p, bound, corners) : rest_weight<Kind>(s.p);
     Vec3<R> d[Kind::corners];
     for (int a = 0; a < Kind::corners; ++a) {
       const R entry = select(weight < none, R(-HUGE_VAL), weight * square[a]);
@@ -316,7 +402,19 @@ struct StencilDiagonal {
   }
 };
 
-// Terms of a report for each corner: its share of the energy; the force per relative error of positions; none inverted.
+// Whether a stencil counts as inverted: 1 or 0
+template <class Kind, class R>
+PD_HD R is_inverted(const Vec3<R> (&f)[Kind::dims], const R (&p)[Kind::numbers]) {
+  const R none(scalar_of<R>(0)), one(scalar_of<R>(1));
+  if constexpr (inverts<Kind>) {
+    const auto counts = dot(f[0], cross(f[1], f[2])) <= none && Kind::weight(p, one, one) > none;
+    return select(counts, one, none);
+  }
+  return none;
+}
+
+// Terms of a report for each corner: its share of the energy; the force per relative error of positions; its share of
+// an inverted tetrahedron.
 struct StencilReport {
   template <class Kind, class Stencils>
   PD_HD void run(const Stencils& stencils) const {
@@ -327,13 +425,14 @@ struct StencilReport {
     Vec3<R> x[Kind::corners], f[Kind::dims], p[Kind::dims];
     stencils.corners(0, x);
     deform<Kind>(x, s.g, f);
-    R energy = none, size = none, square[Kind::corners];
+    R energy = none, size = none, square[Kind::corners], bound = one;
     Kind::template stress<true>(f, s.p, s.c, p, energy);
     for (int a = 0; a < Kind::corners; ++a) size = -lesser(-size, -dot(x[a], x[a]));
     size = square_root(size);
-    gradient_squares<Kind>(s.g, square);
-    const R share = R(T(1) / T(Kind::corners)) * energy, weight = Kind::weight(s.p, one, one);
-    for (int a = 0; a < Kind::corners; ++a) x[a] = {share, (weight * square[a]) * size, none};
+    majoriser_squares<Kind>(s.g, s.p, square, bound);
+    const R part(T(1) / T(Kind::corners)), weight = Kind::weight(s.p, one, one);
+    const R share = part * energy, inverted = part * is_inverted<Kind>(f, s.p);
+    for (int a = 0; a < Kind::corners; ++a) x[a] = {share, (weight * square[a]) * size, inverted};
     stencils.add(x);
   }
 };

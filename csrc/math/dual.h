@@ -46,6 +46,10 @@ struct Dual {
     const R root = square_root(a.value);
     return {root, select(R(none) < root, a.slope / (R(two) * root), R(none))};
   }
+  PD_HD friend Dual exponential(const Dual& a) {
+    const R value = exponential(a.value);
+    return {value, value * a.slope};
+  }
   PD_HD friend Dual lesser(const Dual& a, const Dual& b) { return select(b < a, b, a); }
 
   template <class Mask>
@@ -60,12 +64,14 @@ struct Still {
   using Value = R;
   PD_HD static const R& value(const R& a) { return a; }
   PD_HD static const R& number(const R& a) { return a; }
+  static constexpr bool varies = false;
 };
 template <class R>
 struct Still<Dual<R>> {
   using Value = R;
   PD_HD static const R& value(const Dual<R>& a) { return a.value; }
   PD_HD static Dual<R> number(const R& a) { return {a, R(scalar_of<R>(0))}; }
+  static constexpr bool varies = true;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -48,6 +48,14 @@ PD_HD double rough_square_root(double a) { return sqrt(a); }
 PD_HD float rough_reciprocal(float a) { return reciprocal(a); }
 PD_HD double rough_reciprocal(double a) { return reciprocal(a); }
 
+PD_HD float exponential(float a) { return expf(a); }
+PD_HD double exponential(double a) { return exp(a); }
+PD_HD float logarithm(float a) { return logf(a); }
+PD_HD double logarithm(double a) { return log(a); }
+// exp(a) - 1
+PD_HD float exponential_less_one(float a) { return expm1f(a); }
+PD_HD double exponential_less_one(double a) { return expm1(a); }
+
 PD_HD float lesser(float a, float b) { return b < a ? b : a; }
 PD_HD double lesser(double a, double b) { return b < a ? b : a; }
 PD_HD float select(bool take, float a, float b) { return take ? a : b; }

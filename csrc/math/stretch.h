@@ -53,6 +53,33 @@ struct JacobiState {
   }
 };
 
+// The largest eigenvalue of a symmetric matrix.
+template <class R>
+PD_CALLED void find_largest_eigenvalue(const Mat3<R>& m, R& found) {
+  using T = scalar_of<R>;
+  const R none(T(0)), one(T(1));
+  const Vec3<R>(&row)[3] = m.row;
+  JacobiState<R> state = {{{row[0].x, row[0].y, row[0].z},
+                           {row[0].y, row[1].y, row[1].z},
+                           {row[0].z, row[1].z, row[2].z}},
+                          {{one, none, none}, {none, one, none}, {none, none, one}}};
+  const R least = R(T(0.125) * epsilon<T>()) * (size_of(row[0].x) + size_of(row[1].y) +
+                                                (size_of(row[2].z) + state.largest_off()));
+  for (int round = 0; round < 8; ++round) {
+    if (!any(least < state.largest_off())) break;
+    state.rotate(0, 1, least);
+    state.rotate(0, 2, least);
+    state.rotate(1, 2, least);
+  }
+  found = greater(state.a[0][0], greater(state.a[1][1], state.a[2][2]));
+}
+template <class R>
+PD_HD R largest_eigenvalue(const Mat3<R>& m) {
+  R found;
+  find_largest_eigenvalue(m, found);
+  return found;
+}
+
 template <class R>
 struct Stretches;
 

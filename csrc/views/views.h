@@ -239,8 +239,10 @@ enum EffectNumber : int {
 template <class T>
 struct EffectViews {
   Effects<T> effects;
-  // Field::effect_products: for each array of the effects [batch, rows], null if not wanted
+  // Field::effect_products: for each array of the effects [batch, rows], null if not wanted. Field::next_history: what
+  // is kept
   T* products[effect_count] = {};
+  const T* history_gradients[effect_count] = {};  // Field::next_history_product
 };
 // On a GPU, of tetrahedra; data is null without Poisson's ratio.
 template <class T>
@@ -338,7 +340,11 @@ enum class Field : int {
   damping_gradient,
   damping_product,  // Hessian times direction
   damping_start,  // derivative of gradient times direction by the positions at the start of the step
-  damping_products
+  damping_products,
+  // what stencils keep for the next step, of length 1 / per_time, at its end; and derivatives of its product with given
+  // gradients: by the arrays of the effects, and by the positions
+  next_history,
+  next_history_product
 };
 
 inline bool is_of_damping(Field field) {

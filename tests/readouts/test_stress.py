@@ -177,7 +177,7 @@ def test_gradients_by_finite_differences() -> None:
     stiffness = sim.stiffness.detach().clone().requires_grad_()
 
     def read(x: Tensor, stiffness: Tensor) -> tuple[Tensor, ...]:
-        found = pd.simulation.stress.stress(sim.scene, x, stiffness)
+        found = pd.simulation.stress.stress(sim.scene, x, {"stiffness": stiffness})
         return found.cauchy, found.von_mises, found.strain, sim.vertex_average(found.von_mises)
 
     assert torch.autograd.gradcheck(read, (x, stiffness))

@@ -128,7 +128,9 @@ def test_derivatives_by_the_rows_of_the_material(kind: str) -> None:
     law = KINDS[kind].law(given)
     rates = KINDS[kind].rows(given, law.rates(F))
     products = KINDS[kind].rows(given, law.products(F, dF))
-    assert list(rates) == list(products) == list(given.material)
+    # the rows of flow change the state, and F through it, but not the law
+    of_flow = {"yield_strain", "hardening", "creep_time", "max_flow", "flow"}
+    assert list(rates) == list(products) == [name for name in given.material if name not in of_flow]
     for name, column in ((name, c) for name, values in rates.items() for c in range(values[0].size)):
         step = np.zeros((COUNT, rates[name][0].size))
         step[1::4, column] = 1.0

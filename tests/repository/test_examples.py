@@ -48,6 +48,19 @@ def numbers(text: str, pattern: str) -> list[float]:
     return [float(group.replace(",", "")) for group in found.groups()]
 
 
+def test_yielding_bar(run, pictures) -> None:
+    """The plastic bar keeps some of its bend, the elastic one springs back to its height of .03 m."""
+    text = run("yielding_bar.py", "--cells", "10", "--steps", "12", "--out", "bar.png")
+    bent, kept = numbers(text, r"plastic +(\S+) +(\S+)\n")
+    also_bent, left = numbers(text, r"elastic +(\S+) +(\S+)\n")
+    assert bent > 0.2
+    assert abs(bent - also_bent) < 1e-3
+    assert kept > 0.1
+    assert abs(left - 0.03) < 0.02
+    (strain,) = numbers(text, r"plastic strain (\S+)")
+    assert strain > 0.0
+
+
 def test_no_example_is_left_out() -> None:
     tested = set(re.findall(r'run\("(\w+\.py)"', Path(__file__).read_text()))
     assert tested == {path.name for path in EXAMPLES.glob("*.py")}

@@ -165,8 +165,8 @@ def test_groups_come_by_kind_in_the_order_of_the_table() -> None:
     body = solid(poisson=0.3, law="volume", stiffness_damping=0.1, **options)
     sheet, rod = cloth(warp=3.0, grain=(1, 0, 0), **options), straight()
     parts = (
-        pd.Fibres(body, (1, 0, 0), 1e4), rod, pd.Tie(rod, [4], body, [[0.2, 0.2, 0.0]], stiffness=1.0), sheet, body,
-        pd.Springs(sheet, [[0, 1]], 2.0),
+        pd.Fibres(body, (1, 0, 0), 1e4), rod, pd.Tie(rod, [4], body, [[0.2, 0.2, 0.0]], stiffness=1.0), sheet,
+        solid(plastic=pd.Plastic(0.1)), body, pd.Springs(sheet, [[0, 1]], 2.0),
     )  # fmt: skip
     scene = pd.Scene(*parts)
     values = scene.values()
@@ -178,7 +178,7 @@ def test_groups_come_by_kind_in_the_order_of_the_table() -> None:
         assert group.gradients.shape == (count, kind.corners, kind.columns)
         assert (group.measure.shape, group.constants.shape) == ((count,), (count, kind.constants))
         assert tuple(group.material) == kind.own_rows
-        assert {row.shape for row in group.material.values()} <= {(count,), (count, 3)}
+        assert {row.shape for row in group.material.values()} <= {(count,), (count, 3), (count, 10)}
         assert (group.tets is not None) == kind.of_tets
         largest = np.abs(group.gradients).max(axis=(1, 2))
         assert (np.abs(group.gradients.sum(axis=1)).max(axis=1) <= EXACT * largest).all()

@@ -123,6 +123,11 @@ def tune(
     for solver in candidates or ():
         if not isinstance(solver, Solver):
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
+    if sim.keeps_history:
+        raise ValueError(
+            "tune: the scene must have no plastic solids, whose flow its study does not follow, got some; set solver "
+            "and iterations"
+        )
     start = sim.rest_state() if state is None else state
     check_start(sim, start, forces)
     study = _make_study(_with_targets(sim, targets, len(start[0])), start, forces, error)

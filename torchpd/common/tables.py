@@ -11,6 +11,7 @@ __all__ = [
     "DEVICE_SIZES",
     "DEVICE_STENCIL_TABLE",
     "EFFECT_ROWS",
+    "HISTORY_ROWS",
     "KINDS",
     "MATERIAL_TABLE",
     "MULTILEVEL_TABLE",
@@ -45,6 +46,7 @@ class MaterialRow(NamedTuple):
     rows: str
     meaning: str
     effect: bool  # whether only some scenes have it
+    history: bool = False  # whether a step leaves it for the next one, as a part of the state
 
     @property
     def dims(self) -> int:
@@ -62,6 +64,7 @@ class Kind(NamedTuple):
     rows: tuple[str, ...]  # names of its arrays in the material
     meaning: str
     quadratic: int  # its first arrays that make a quadratic energy where a scene lacks the others; 0: none do
+    on_gpu: bool  # whether a GPU has kernels for it
 
     @property
     def of_tets(self) -> bool:
@@ -98,6 +101,8 @@ DEVICE_STENCIL_TABLE = tuple(PlanRow(*row) for row in _C.device_stencil_table())
 MATERIAL_TABLE = tuple(MaterialRow(*row) for row in _C.material_table())
 # arrays of the material that only some scenes have; they follow the others
 EFFECT_ROWS = tuple(row for row in MATERIAL_TABLE if row.effect)
+# those of them that are a part of the state
+HISTORY_ROWS = tuple(row for row in MATERIAL_TABLE if row.history)
 KINDS = {row.name: row for row in (Kind(*row) for row in _C.kind_table())}
 SETTINGS_TABLE = tuple(SettingRow(*row) for row in _C.settings_table())
 # columns of the material arrays

@@ -196,9 +196,8 @@ def is_uneven(compiled: CompiledScene) -> bool:
     """Whether a body has a dihedral angle below five degrees, or a stiffness ratio of 30 between tetrahedra."""
     if any(_smallest_angle(solid.mesh) < _EVEN_ANGLE for solid in compiled.scene.solids):
         return True
-    bodies = (
-        compiled.named["stiffness"].detach().split([len(solid.mesh.tets) for solid in compiled.scene.solids], dim=-1)
-    )
+    counts = [len(solid.mesh.tets) for solid in compiled.scene.elastic_solids]
+    bodies = compiled.named["stiffness"].detach().split(counts, dim=-1) if counts else ()
     return any(bool((body.amax(-1) > _EVEN_STIFFNESS * body.amin(-1)).any()) for body in bodies)
 
 

@@ -32,6 +32,7 @@ from ..scene.fibres import Fibres
 from ..scene.loads import Pressure, Wind
 from ..scene.part import Body
 from ..scene.pins import PIN_HARD
+from ..scene.plastic import Plastic
 from ..scene.rod import Rod
 from ..scene.scene import Part, Scene
 from ..scene.solvers import Chebyshev, Jacobi, Multilevel, Solver
@@ -52,7 +53,7 @@ _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in _PARTS}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
 _BODIES = {"body", "other", "solid"}  # fields that hold a body of the scene
 # fields that the first files of format 2 lack
-_LATER = {"poisson", "averaging", "law", "strain_limit", "limit_stiffness", "stiffness_damping"}
+_LATER = {"poisson", "averaging", "law", "strain_limit", "limit_stiffness", "stiffness_damping", "plastic"}
 # inputs of a preconditioner, which with the mesh determine its bits
 _REFERENCE = ("stiffness", "inertia")
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in (torch.float32, torch.float64)}
@@ -163,6 +164,9 @@ def _part_arrays(part: Part) -> dict[str, NDArray[Any]]:
             arrays[name] = value
         elif isinstance(value, TriMesh):
             own = {"vertices": value.vertices, "triangles": value.triangles, "uvs": value.uvs}
+            arrays.update({f"{name}.{key}": array for key, array in own.items() if array is not None})
+        elif isinstance(value, Plastic):
+            own = {field.name: getattr(value, field.name) for field in dataclasses.fields(Plastic)}
             arrays.update({f"{name}.{key}": array for key, array in own.items() if array is not None})
     return arrays
 
@@ -325,6 +329,9 @@ def _part(number: int, record: Record, meshes: list[TetMesh], parts: Mapping[int
         whole = f"part.{number}.{field.name}"
         if tensors.has(f"{whole}.triangles"):
             fields[field.name] = _surface(whole, tensors)
+        elif tensors.has(f"{whole}.yield_strain"):
+            names = [one.name for one in dataclasses.fields(Plastic) if tensors.has(f"{whole}.{one.name}")]
+            fields[field.name] = Plastic(**{name: tensors.array(f"{whole}.{name}") for name in names})
         elif tensors.has(whole) or field.name not in _LATER:
             fields[field.name] = tensors.array(whole)
     part: Part = kind(**fields)

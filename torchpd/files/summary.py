@@ -43,6 +43,7 @@ _OF_SOLIDS = {
     "solid_limit": "strain limits",
     "volume": 'law "volume"',
     "damper": "stiffness-proportional damping",
+    "plastic": "plastic flow",
 }
 
 _ANY_BATCH = 2**31 - 1
@@ -137,7 +138,7 @@ def _body_lines(scene: Scene) -> list[str]:
         lines.append(f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step per iteration")
     groups = [
         solid.averaging_groups
-        for solid in scene.solids
+        for solid in scene.elastic_solids
         if not isinstance(solid.poisson, float) and solid.law == "corotated"
     ]
     if groups:

@@ -13,6 +13,7 @@ from torch.utils._pytree import tree_leaves
 from .. import _C
 from ..common.tables import (
     EFFECT_ROWS,
+    HISTORY_ROWS,
     KINDS,
     MATERIAL_TABLE,
     MULTILEVEL_TABLE,
@@ -169,6 +170,19 @@ def _(
     by_state = [positions.new_empty(positions.shape) for _ in range(2)]
     by_stiffness = positions.new_empty((len(positions), material[_STIFFNESS].shape[-1]))
     return [*by_state, by_stiffness, *_fake_products(positions, material)]
+
+
+@_register_fake("next_history")
+def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor], *, time_step: float) -> list[Tensor]:
+    named = named_material(material)
+    return [positions.new_empty((len(positions), *named[row.name].shape[-2:])) for row in HISTORY_ROWS]
+
+
+@_register_fake("next_history_vjp")
+def _(
+    gradients: Sequence[Tensor], positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor], **_: Any
+) -> list[Tensor]:
+    return [positions.new_empty(positions.shape), *_fake_products(positions, material)]
 
 
 @_register_fake("elastic_diagonal")
@@ -410,6 +424,19 @@ def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tens
     return x, _for_material(material, w, effects), _for_plan(ctx)
 
 
+def _save_history(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+    positions, material, ctx.plan = inputs
+    ctx.time_step = keyword_only_inputs["time_step"]
+    ctx.save_for_backward(positions, *material)
+
+
+def _history_backward(ctx: Any, grads: Sequence[Tensor]) -> tuple[Tensor, list[Tensor | None], list[None]]:
+    positions, *material = ctx.saved_tensors
+    given = [grad.contiguous() for grad in grads]
+    x, *each = _ops.next_history_vjp(given, positions, material, ctx.plan, time_step=ctx.time_step)
+    return x, _for_material(material, None, _sum_to_rows(material, each)), _for_plan(ctx)
+
+
 def _save_damping(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
     positions, start, material, ctx.plan = inputs
     ctx.time_step = keyword_only_inputs["time_step"]
@@ -512,6 +539,7 @@ register_rule("rollout_vjp", rollout_vjp_rule)
 
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::damping_gradient", _damping_backward, setup_context=_save_damping)
+torch.library.register_autograd("torchpd::next_history", _history_backward, setup_context=_save_history)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)
 
 for _name, _backward, _setup in (

@@ -136,6 +136,20 @@ def _vjp_rule(
     return [*grads[:3], *summed], 0
 
 
+def _history_vjp_rule(
+    info: Any, in_dims: Any, gradients: list[Tensor], *args: Any, **numbers: Any
+) -> tuple[list[Tensor], int]:
+    op, dims = _ops.next_history_vjp, in_dims[0]
+
+    def of_one(*own: Any, **settings: Any) -> Any:
+        chosen = [t if dim is None else t.select(dim, 0) for t, dim in zip(gradients, dims, strict=True)]
+        return op(chosen, *own, **settings)
+
+    joined, maps = _join_all(of_one, info, in_dims[1:], args, read=_ELASTIC, **numbers)
+    wide = [_join(t, dim, *maps, 2) for t, dim in zip(gradients, dims, strict=True)]
+    return [t.unflatten(0, maps) for t in op(wide, *joined, **numbers)], 0
+
+
 def _diagonal_rule(info: Any, in_dims: Any, material: list[Tensor], plan: list[Tensor], **options: Any) -> Any:
     _check_plan(in_dims[1])
     place = list(_OWN).index("stiffness")
@@ -176,6 +190,8 @@ for _name in ("gradient", "hessian_product", "effect_energy"):
 register_rule("damping_gradient", _batch_rule("damping_gradient", read=_ELASTIC))
 for _name in ("element_energy", "element_energy_product"):
     register_rule(_name, _batch_rule(_name, read=("stiffness",)))
+register_rule("next_history", _batch_rule("next_history", read=_ELASTIC))
+register_rule("next_history_vjp", _history_vjp_rule)
 register_rule("step", _batch_rule("step"))
 register_rule("rollout", _batch_rule("rollout", 1))
 register_rule("elastic_diagonal", _diagonal_rule)

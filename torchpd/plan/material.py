@@ -10,12 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from ..common.tables import MATERIAL_TABLE, PLANES, SPHERES, MaterialRow
+from ..common.tables import HISTORY_ROWS, MATERIAL_TABLE, PLANES, SPHERES, MaterialRow
 from ..scene.pins import PIN_HARD, hold_exactly, split_springs
 from ..scene.scene import SceneValues
 
 __all__ = [
     "CORE_ROWS",
+    "HISTORY_PLACES",
     "LOAD_ROWS",
     "MATERIAL_ROWS",
     "SCENE_NAME_HINTS",
@@ -44,6 +45,7 @@ LOAD_ROWS = (
 )
 MATERIAL_ROWS = {row.name: row for row in (*MATERIAL_TABLE, *LOAD_ROWS)}
 CORE_ROWS = tuple(row.name for row in MATERIAL_TABLE if not row.effect)  # arrays that every scene has
+HISTORY_PLACES = tuple(MATERIAL_TABLE.index(row) for row in HISTORY_ROWS)  # in the material of the ops
 # hints for names of scene arguments given to `set_material`
 SCENE_NAME_HINTS = {
     "activation": "it is an input of steps, targets={fibres: activation}; fibre_length is 1 - contraction activation",
@@ -52,12 +54,13 @@ SCENE_NAME_HINTS = {
     "youngs": "stiffness holds Young's modulus of each tetrahedron [Pa]",
 }
 
-_POSITIVE = ("stiffness", "masses", "membrane_youngs", "thickness")
+_POSITIVE = ("stiffness", "masses", "membrane_youngs", "thickness", "plastic_youngs", "yield_strain")
 _NOT_NEGATIVE = (
     "bending", "rest_curvature", "spring_stiffness", "rest_length", "tie_stiffness", "fibre_stiffness", "fibre_length",
-    "thread_stiffness", "stiffness_damping",
+    "thread_stiffness", "stiffness_damping", "hardening", "creep_time",
 )  # fmt: skip
 _LIMITS = ("solid_limit", "cloth_limit")
+_POISSON = ("poisson", "plastic_poisson")
 _UNIT_SLACK = 1e-4  # tolerance on the length of a plane normal: float32 rounding, and that of a training step
 
 
@@ -145,6 +148,9 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
     if name == "pin_stiffness":
         _require(tensor >= 0, full, ">= 0, inf for pins that hold exactly,", tensor)
         return
+    if name == "max_flow":
+        _require(tensor > 0, full, "positive, inf for no bound,", tensor)
+        return
     _require(tensor.isfinite(), full, "finite", tensor)
     if name in _POSITIVE:
         _require(tensor > 0, full, "positive", tensor)
@@ -152,7 +158,7 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
         _require(tensor >= 0, full, ">= 0", tensor)
     elif name == "membrane_poisson":
         _require((tensor > -1) & (tensor < 1), full, "in (-1, 1)", tensor)
-    elif name == "poisson":
+    elif name in _POISSON:
         _require((tensor > -1) & (tensor < 0.495), full, "in (-1, 0.495)", tensor)
     elif name == "damping":
         _require(tensor >= 0, full, ">= 0", tensor)
@@ -161,6 +167,9 @@ def check_material(owner: str, name: str, tensor: Tensor) -> None:
         _require((low >= 0) & (low <= 1), f"{full}: lo (column 0)", "in [0, 1]", low)
         _require(high >= 1, f"{full}: hi (column 1)", "at least 1", high)
         _require(stiffness >= 0, f"{full}: stiffness (column 2)", ">= 0", stiffness)
+    elif name == "flow":
+        plastic = tensor[..., :9].unflatten(-1, (3, 3))
+        _require(torch.linalg.det(plastic) > 0, f"{full}: Fp (columns 0 to 8)", "of positive determinant", tensor)
     elif name == "planes":
         lengths = tensor[..., PLANES["normal"]].norm(dim=-1)
         _require((lengths - 1).abs() <= _UNIT_SLACK, f"{full}: the normal (columns 0 to 2)", "of unit length", tensor)
@@ -210,7 +219,8 @@ def check_array(owner: str, name: str, value: Tensor | float, own: Tensor) -> Te
     tensor = expand_rows(name, tensor, shape[0] if shape else 1)
     if tuple(tensor.shape) != shape and tuple(tensor.shape[1:]) != shape:
         came = f"one number, {tensor.item():g}" if alone else list(tensor.shape)
-        things = {"tet": "tetrahedra", "vertex": "vertices"}.get(row.rows, f"{row.rows}s")
+        irregular = {"tet": "tetrahedra", "vertex": "vertices", "plastic": "plastic tetrahedra"}
+        things = irregular.get(row.rows, f"{row.rows}s")
         scene = "" if row.rows == "one" else f"; {things} of the scene: {shape[0]}"
         raise ValueError(f"{owner}: {name} must be {list(shape)}, or with a batch in front, got {came}{scene}")
     check_material(owner, name, tensor)

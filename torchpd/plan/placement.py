@@ -102,6 +102,12 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
     values = values if loose is None else replace(values, loose=loose)
     if device.type != "cuda":
         return compile_plan(values, dtype=dtype, progress=compiled.progress)
+    lacking = [group.kind for group in values.stencils if not KINDS[group.kind].on_gpu]
+    if lacking:
+        raise RuntimeError(
+            f"Simulator: device must be the CPU for scenes with plastic solids ({', '.join(lacking)}), which have no "
+            f"kernels for {device}; keep it there, or leave plastic out"
+        )
     return choose_plan(
         values, dtype, properties_of(device), compiled.kernel,
         levels=isinstance(compiled.solver, Multilevel), batch=compiled.batch, progress=compiled.progress,

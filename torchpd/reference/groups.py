@@ -15,6 +15,7 @@ from ..scene.stencils import StencilGroup
 from .geometry import elements, gradient_operator, spreads
 from .kinds import KINDS, Given
 from .laws import Law
+from .plastic import flowed
 
 __all__ = ["ElementGroup", "groups_of", "tetrahedra"]
 
@@ -31,9 +32,15 @@ class ElementGroup:
     time_step: float  # h [s]
 
     @cached_property
+    def gradients(self) -> Array:
+        """g_a [N, n, d] of the energy: Fp^-T g_a after flow."""
+        own = self.stencils
+        return flowed(own, own.material["flow"][:, :9].reshape(-1, 3, 3)).gradients if _flows(own) else own.gradients
+
+    @cached_property
     def operator(self) -> csr_array:
         """G [dN, V]: (G x) in rows dn..dn+d-1 is F_n^T."""
-        return gradient_operator(self.stencils.gradients, self.stencils.corners, len(self.positions))
+        return gradient_operator(self.gradients, self.stencils.corners, len(self.positions))
 
     @cached_property
     def adjoint(self) -> csr_array:
@@ -79,7 +86,7 @@ class ElementGroup:
     @cached_property
     def weighted_diagonal(self) -> Array:
         """Entries [V] of Dbar, N/m: V (q l_e + n k) |g_a|^2 of each corner (`reference.laws`)."""
-        gradients, law = self.stencils.gradients, self.law
+        gradients, law = self.gradients, self.law
         corners = (gradients != 0.0).any(axis=2).sum(axis=1)
         weight = spreads(gradients) * (law.quadratic * law.measure) + corners * (law.trace * law.measure)
         return self._gathered(weight, gradients)
@@ -87,12 +94,12 @@ class ElementGroup:
     @cached_property
     def plain_diagonal(self) -> Array:
         """The diagonal [V] of `matrix`, N/m."""
-        return self._gathered(self.law.matrix_weight * self.law.measure, self.stencils.gradients)
+        return self._gathered(self.law.matrix_weight * self.law.measure, self.gradients)
 
     @cached_property
     def matrix(self) -> csr_array:
         """The sum [V, V] of V w g g^T, N/m."""
-        width = self.stencils.gradients.shape[2]
+        width = self.gradients.shape[2]
         weight = np.repeat(self.law.matrix_weight * self.law.measure, width)
         return csr_array(self.adjoint @ (diags_array(weight) @ self.operator))
 
@@ -115,6 +122,10 @@ class ElementGroup:
     def material_rows(self, rates: dict[str, Array]) -> dict[str, Array]:
         """Derivatives by the rows of the material, from those by the parameters of the law."""
         return KINDS[self.stencils.kind].rows(self.given, rates)
+
+
+def _flows(stencils: StencilGroup) -> bool:
+    return "flow" in stencils.material
 
 
 def tetrahedra(values: SceneValues) -> StencilGroup:

@@ -35,6 +35,7 @@ from .part import (
     selected,
     set_fields,
 )
+from .plastic import Plastic
 from .stencils import StencilGroup
 
 __all__ = ["Damping", "Gravity", "Ground", "Pin", "Solid", "Sphere"]
@@ -84,6 +85,8 @@ class Solid(Body):
         stiffness_damping: beta [s], a scalar or one value per tetrahedron: Rayleigh damping by the stiffness, in the
             frame of the material. The axial stress of a step is 2 mu beta (s - s_t) / h beside the elastic one. A rigid
             rotation feels none. It acts by mu alone, also with a Poisson's ratio.
+        plastic: how the solid flows, see `Plastic`; None: it is elastic. It takes law="corotated", averages nothing,
+            and has no stiffness_damping. Its state is a `HistoryState`; its modulus `plastic_youngs`.
 
     Example:
         >>> rubber = Solid(mesh, youngs=1e6, poisson=0.4, density=1100.0)
@@ -98,6 +101,7 @@ class Solid(Body):
     strain_limit: Array | None  # [E, 2]
     limit_stiffness: Array | None  # [E]
     stiffness_damping: Array | float  # [E], or 0.0
+    plastic: Plastic | None
 
     @check_arguments("Solid")
     def __init__(
@@ -112,6 +116,7 @@ class Solid(Body):
         strain_limit: Any = None,
         limit_stiffness: ArrayLike | None = None,
         stiffness_damping: ArrayLike = 0.0,
+        plastic: Plastic | None = None,
     ) -> None:
         if not isinstance(mesh, TetMesh):
             raise TypeError(
@@ -133,7 +138,25 @@ class Solid(Body):
             strain_limit=None if limits is None else limits[:, :2],
             limit_stiffness=None if limits is None else limits[:, 2],
             stiffness_damping=_stiffness_damping(stiffness_damping, count),
+            plastic=plastic,
         )
+        if plastic is not None:
+            self._check_plastic(plastic)
+
+    def _check_plastic(self, plastic: Plastic) -> None:
+        if not isinstance(plastic, Plastic):
+            raise TypeError(f"Solid.plastic must be a Plastic or None, got {type(plastic).__name__}")
+        plastic.rows(len(self.mesh.tets))
+        refused = {
+            'law must be "corotated"': self.law != "corotated",
+            "averaging must be 1 or None": not (self.averaging is None or np.array_equal(self.averaging, 1)),
+            "stiffness_damping must be 0": not isinstance(self.stiffness_damping, float),
+        }
+        for contract, broken in refused.items():
+            if broken:
+                raise ValueError(
+                    f"Solid.{contract} beside plastic, whose elements have a law of their own, got another"
+                )
 
     @property
     def elements(self) -> Index:
@@ -146,7 +169,7 @@ class Solid(Body):
 
     def stencils(self, place: Place) -> tuple[StencilGroup, ...]:
         is_damped = not isinstance(self.stiffness_damping, float)
-        if self.strain_limit is None and self.law != "volume" and not is_damped:
+        if self.strain_limit is None and self.law != "volume" and not is_damped and self.plastic is None:
             return ()
         corners, tets = self.mesh.tets + place(self), np.arange(len(self.mesh.tets), dtype=np.int64)
         gradients, volumes = shape_gradients(self.mesh.vertices, self.mesh.tets)
@@ -159,6 +182,10 @@ class Solid(Body):
             groups.append(StencilGroup.of("volume", corners, gradients, volumes, tets=tets))
         if is_damped:
             groups.append(StencilGroup.of("damper", corners, gradients, volumes, tets=tets))
+        if self.plastic is not None:
+            rows_of = {"plastic_youngs": self.stiffness, "plastic_poisson": np.broadcast_to(self.poisson, len(tets))}
+            rows_of |= self.plastic.rows(len(tets))
+            groups.append(StencilGroup.of("plastic", corners, gradients, volumes, **rows_of))
         return tuple(groups)
 
     @property

@@ -35,7 +35,7 @@ class SceneValues:
     """Flat float64 arrays of a scene in the user's order, bodies one after another."""
 
     rest_positions: Array  # [V, 3] m
-    tets: Index  # [E, 4]
+    tets: Index  # [E, 4], of all solids but plastic ones, as in the arrays of tetrahedra below
     stiffness: Array  # [E] Young's modulus times fill, Pa, with a fill of at least 0.1
     density: Array  # [E] density times fill, kg/m^3
     masses: Array  # [V] kg, lumped: density * volume / 4 to each corner of a tetrahedron, a third to one of a triangle
@@ -134,6 +134,11 @@ class Scene:
         return self._all(Solid)
 
     @property
+    def elastic_solids(self) -> tuple[Solid, ...]:
+        """The solids whose tetrahedra have rows in arrays like `stiffness`: all but plastic ones."""
+        return tuple(solid for solid in self.solids if solid.plastic is None)
+
+    @property
     def rest_positions(self) -> Array:
         """Rest positions of all bodies [V, 3] m."""
         return np.concatenate([body.mesh.vertices for body in self.bodies])
@@ -141,7 +146,10 @@ class Scene:
     @property
     def tets(self) -> Index:
         """Corners of the tetrahedra of all solids [E, 4], numbered over the vertices of all bodies."""
-        own = (solid.mesh.tets + self.vertex_range(solid).start for solid in self.solids)
+        return self._tets_of(self.solids)
+
+    def _tets_of(self, solids: Iterable[Solid]) -> Index:
+        own = (solid.mesh.tets + self.vertex_range(solid).start for solid in solids)
         return np.concatenate([np.zeros((0, 4), dtype=np.int64), *own])
 
     @property
@@ -214,9 +222,9 @@ class Scene:
         poisson, tet_group = self._poisson()
         return SceneValues(
             rest_positions=positions,
-            tets=self.tets,
-            stiffness=np.concatenate([none, *(solid.stiffness for solid in self.solids)]),
-            density=np.concatenate([none, *(solid.filled_density for solid in self.solids)]),
+            tets=self._tets_of(self.elastic_solids),
+            stiffness=np.concatenate([none, *(solid.stiffness for solid in self.elastic_solids)]),
+            density=np.concatenate([none, *(solid.filled_density for solid in self.elastic_solids)]),
             masses=masses,
             pin_vertices=pin_vertices,
             pin_stiffness=stiffness,
@@ -242,7 +250,7 @@ class Scene:
         for part in self.parts:
             for group in part.stencils(lambda body: starts[id(body)]):
                 yield group if group.tets is None else replace(group, tets=group.tets + tets)
-            tets += len(part.mesh.tets) if isinstance(part, Solid) else 0
+            tets += len(part.mesh.tets) if isinstance(part, Solid) and part.plastic is None else 0
 
     def _components(self) -> Index:
         """Number of the connected component of each vertex within its body [V]."""
@@ -254,9 +262,9 @@ class Scene:
 
     def _poisson(self) -> tuple[Array | None, Index | None]:
         """Poisson's ratios of all tetrahedra and their groups, or None if every solid has the scalar 0."""
-        if all(isinstance(solid.poisson, float) for solid in self.solids):
+        if all(isinstance(solid.poisson, float) for solid in self.elastic_solids):
             return None, None
-        ratios = [np.broadcast_to(solid.poisson, len(solid.mesh.tets)) for solid in self.solids]
+        ratios = [np.broadcast_to(solid.poisson, len(solid.mesh.tets)) for solid in self.elastic_solids]
         poisson, group = np.concatenate(ratios), self.averaging_groups
         check_signs("Solid.poisson", poisson, group)
         return poisson, group
@@ -265,7 +273,7 @@ class Scene:
     def averaging_groups(self) -> Index:
         """Numbers of the groups of tetrahedra that share the mean of their volume strain [E]."""
         groups, count = [np.zeros(0, dtype=np.int64)], 0
-        for solid in self.solids:
+        for solid in self.elastic_solids:
             if solid.law == "volume":  # a kind of its own has their volume energy
                 groups.append(np.full(len(solid.mesh.tets), -1))
                 continue
@@ -276,7 +284,7 @@ class Scene:
     @property
     def damped_tets(self) -> NDArray[np.bool_]:
         """Whether the solid of each tetrahedron has stiffness-proportional damping [E]."""
-        solids = self.solids
+        solids = self.elastic_solids
         return np.repeat(
             [not isinstance(solid.stiffness_damping, float) for solid in solids],
             [len(solid.mesh.tets) for solid in solids],
@@ -284,9 +292,9 @@ class Scene:
 
     def _stiffness_damping(self) -> Array | None:
         """Coefficients of all tetrahedra [E] s, or None without damping."""
-        if all(isinstance(solid.stiffness_damping, float) for solid in self.solids):
+        if all(isinstance(solid.stiffness_damping, float) for solid in self.elastic_solids):
             return None
-        return np.concatenate([np.broadcast_to(s.stiffness_damping, len(s.mesh.tets)) for s in self.solids])
+        return np.concatenate([np.broadcast_to(s.stiffness_damping, len(s.mesh.tets)) for s in self.elastic_solids])
 
     def __repr__(self) -> str:
         return f"Scene({', '.join(type(part).__name__ for part in self.parts)})"

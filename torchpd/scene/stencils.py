@@ -47,6 +47,12 @@ KINDS: dict[str, Kind] = {
     "cloth_limit": Kind(3, 2, 0, ("cloth_limit",)),
     "volume": Kind(4, 3, 0, ("stiffness", "poisson"), of_tets=True),
     "damper": Kind(4, 3, 0, ("stiffness", "poisson", "stiffness_damping"), of_tets=True),
+    "plastic": Kind(
+        4,
+        3,
+        0,
+        ("plastic_youngs", "plastic_poisson", "yield_strain", "hardening", "creep_time", "max_flow", "flow"),
+    ),
 }
 
 
@@ -64,6 +70,7 @@ class StencilGroup:
     - solid_limit, cloth_limit: F and V of a tetrahedron or a triangle; k/2 dist^2(F, {stretches in [lo, hi]}), also
       det F > 0 of a tetrahedron.
     - volume: F and V of a tetrahedron; 3 lambda/2 dist^2(F, {det F = 1}).
+    - plastic: F and V of a tetrahedron; the corotated law of a solid on F Fp^-1, Fp of the row `flow`.
     - damper: F and V of a tetrahedron; mu beta/h |F - R U_t|^2, U_t the stretch at the start of a step.
     """
 

@@ -146,6 +146,8 @@ def _hint(name: str) -> str:
     if name in ("solid_limit", "cloth_limit"):
         part = "solid" if name == "solid_limit" else "cloth"
         return f"; no {part} has a strain_limit, which leaves it out: give {part.title()}(strain_limit=)"
+    if name in MATERIAL_ROWS and MATERIAL_ROWS[name].rows == "plastic":
+        return "; no solid is plastic, which leaves it out: give Solid(plastic=)"
     if name in MATERIAL_ROWS:
         rows = MATERIAL_ROWS[name].rows
         return f"; the scene has no {name if rows == 'one' else rows}"

@@ -16,7 +16,7 @@ from ..ops.diagonal import named_material
 from ..plan.compiled import persistent_tensors
 from ..plan.cpu_plan import Plan, compile_plan
 from ..plan.kernel_choice import check_kernel
-from ..plan.material import CORE_ROWS, material_of, ops_names, with_absent
+from ..plan.material import CORE_ROWS, HISTORY_PLACES, material_of, ops_names, with_absent
 from ..plan.mutation_guard import MutationGuard, check_rest
 from ..plan.placement import check_target_device, is_recording
 from ..scene.pins import PIN_HARD, hold_exactly
@@ -47,7 +47,7 @@ from .settings import (
     prepare,
     reconfigure,
 )
-from .state import State
+from .state import History, HistoryState, State
 from .state_checks import (
     check_adjoint,
     check_batch,
@@ -403,7 +403,7 @@ class Model(nn.Module):
         load_material(self, state_dict, prefix, rest, self._replace_material, super()._load_from_state_dict)
         self._refresh_pin_mask()
 
-    def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
+    def check_state(self, state: State | HistoryState, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
         """Check a state and forces; return the forces of every environment.
 
         Args:
@@ -411,11 +411,27 @@ class Model(nn.Module):
             forces: as in `forward`.
             fix: end of the errors about forces of another shape.
         """
-        return check_state(self._checked_rest(), state, forces=forces, fix=fix)
+        return check_state(self._checked_rest(), state, self.history_at_rest(), forces=forces, fix=fix)
 
-    def positions_of(self, state: State | Tensor, name: str = "state") -> Tensor:
+    def positions_of(self, state: State | HistoryState | Tensor, name: str = "state") -> Tensor:
         """Positions of a state, or positions alone, after all checks."""
-        return positions_of(self._checked_rest(), state, name)
+        return positions_of(self._checked_rest(), state, self.history_at_rest(), name)
+
+    @property
+    def keeps_history(self) -> bool:
+        """Whether a step leaves more than positions and velocities, so that states are a `HistoryState`."""
+        return any(name in self.material_names for name in History._fields)
+
+    def history_at_rest(self) -> History | None:
+        """The history of a new state, with or without a batch; None where the scene keeps none."""
+        return History(*(getattr(self, name) for name in History._fields)) if self.keeps_history else None
+
+    def with_history(self, material: list[Tensor], state: State | HistoryState | Tensor) -> list[Tensor]:
+        """The material with the history of a checked state; positions alone have that of a new state."""
+        if isinstance(state, Tensor) or not self.keeps_history:
+            return material
+        own = dict(zip(HISTORY_PLACES, state[2], strict=True))  # type: ignore[misc]
+        return [own[place].contiguous() if place in own else array for place, array in enumerate(material)]
 
     def _checked_rest(self) -> Tensor:
         rest = self.rest_positions

@@ -19,7 +19,7 @@ from ..geometry.overlaps import Overlap, boxes_meet, find_overlaps
 from ..plan.material import CORE_ROWS
 from ..scene.effects import Solid
 from ..scene.scene import Scene
-from .state import State
+from .state import HistoryState, State
 
 __all__ = ["Notices", "warn_of_scene"]
 
@@ -79,7 +79,9 @@ class Notices:
     def __reduce__(self) -> tuple[type[Notices], tuple[()]]:
         return Notices, ()
 
-    def before(self, owner: object, state: State, material: list[Tensor], time_step: float, *, report: bool) -> None:
+    def before(
+        self, owner: object, state: State | HistoryState, material: list[Tensor], time_step: float, *, report: bool
+    ) -> None:
         """Check the start of the first step, and of every step that reports."""
         # tested first, so that no compiled step depends on past warnings
         if torch.compiler.is_compiling() or not (report or not self._started) or "inside" in self._said:

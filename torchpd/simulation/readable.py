@@ -13,8 +13,9 @@ from ..common.checks import check_like
 from ..ops.adjoint import AdjointCall
 from ..ops.diagonal import named_material
 from ..ops.registration import refuse_forward_mode
-from ..plan.material import LOAD_ROWS, check_environments, named_arrays
+from ..plan.material import LOAD_ROWS, check_environments
 from ..scene.cloth import Cloth
+from ..scene.effects import Solid
 from ..scene.fibres import Fibres
 from ..scene.part import Body
 from ..scene.rod import Rod
@@ -22,9 +23,9 @@ from ..scene.springs import Springs
 from ..scene.targets import Targets
 from .model import Model
 from .readouts import ContactForces, Reactions, contact_forces, reactions
-from .state import State
+from .state import HistoryState, State
 from .stencil_readouts import MembraneStress, Tension, membrane_stress, tensions
-from .stress import Stress, stress, vertex_average
+from .stress import STRESS_ROWS, Stress, plastic_strain, stress, vertex_average
 from .volume import volumes
 from .vtu import States, write_vtu
 
@@ -35,24 +36,28 @@ class Readable(Model):
     """Read-outs of steps and states of a `Simulator`; docs/readouts.md is a guide."""
 
     def checked_call(
-        self, state: State, after: State | Tensor, forces: Tensor | None, targets: Targets | None
+        self,
+        state: State | HistoryState,
+        after: State | HistoryState | Tensor,
+        forces: Tensor | None,
+        targets: Targets | None,
     ) -> AdjointCall:
         """The step from a state to the positions `after`, with all arguments checked."""
         forces = self.check_state(state, forces=forces)
         before, positions = self.positions_of(state), self.positions_of(after, "after")
         check_like("after", positions, before, "m")
-        material = self.material_at(targets, len(before))
+        material = self.with_history(self.material_at(targets, len(before)), state)
         check_environments("state", len(before), named_material(material))
         forces = self.forces_at(state, forces, targets, material)
         return AdjointCall(before, state[1], forces, positions, material, list(self.plan.arrays), self.time_step)
 
     def forces_at(
-        self, state: State, forces: Tensor | None, targets: Targets | None, material: list[Tensor]
+        self, state: State | HistoryState, forces: Tensor | None, targets: Targets | None, material: list[Tensor]
     ) -> Tensor | None:
         """All forces of a step from a checked state: `forces`, and those of pressure and wind."""
         if self.loads is None:
             return forces
-        refuse_forward_mode(*state)
+        refuse_forward_mode(state[0], state[1])
         positions, named = self.positions_of(state), named_material(material)
         values = self.load_values(targets, len(positions))
         check_environments("state", len(positions), {"masses": named["masses"], **values})
@@ -64,7 +69,7 @@ class Readable(Model):
         own = {row.name: getattr(self, row.name) for row in LOAD_ROWS if row.name in self.material_names}
         return self.anchors.place_loads(targets, own, batch=batch)
 
-    def load_forces(self, state: State, targets: Targets | None = None) -> Tensor:
+    def load_forces(self, state: State | HistoryState, targets: Targets | None = None) -> Tensor:
         """Forces of pressure and wind on the vertices [B, V, 3] [N] in a step from `state`. Differentiable.
 
         They are those at the start of the step. A step adds them to its `forces`, so no one has to give them.
@@ -80,8 +85,8 @@ class Readable(Model):
 
     def contact_forces(
         self,
-        state: State,
-        after: State | Tensor,
+        state: State | HistoryState,
+        after: State | HistoryState | Tensor,
         forces: Tensor | None = None,
         targets: Targets | None = None,
         *,
@@ -116,8 +121,8 @@ class Readable(Model):
 
     def reactions(
         self,
-        state: State,
-        after: State | Tensor,
+        state: State | HistoryState,
+        after: State | HistoryState | Tensor,
         forces: Tensor | None = None,
         targets: Targets | None = None,
         *,
@@ -140,7 +145,7 @@ class Readable(Model):
         """
         return reactions(self.scene, self.checked_call(state, after, forces, targets), about)
 
-    def stress(self, state: State | Tensor) -> Stress:
+    def stress(self, state: State | HistoryState | Tensor) -> Stress:
         """Cauchy stress [B, E, 3, 3] and von Mises stress [B, E] [Pa] of every tetrahedron, and its strain.
 
         sigma = w (F - R) F^T / det F without a Poisson's ratio, with w Young's modulus, F the deformation gradient and
@@ -150,14 +155,24 @@ class Readable(Model):
         Args:
             state: a `State`, or positions [B, V, 3].
         """
-        positions, stiffness = self.positions_of(state), self.stiffness
-        rows = {"stiffness": stiffness}
-        if "poisson" in self.material_names:
-            rows["poisson"] = named_arrays(self)["poisson"]
+        positions = self.positions_of(state)
+        rows = named_material(self.with_history(self.material(), state))
+        rows = {name: rows[name] for name in STRESS_ROWS if name in self.material_names}
         check_environments("state", len(positions), rows)
-        return stress(self.scene, positions, stiffness, rows.get("poisson"))
+        return stress(self.scene, positions, rows)
 
-    def membrane_stress(self, state: State | Tensor) -> dict[Cloth, MembraneStress]:
+    def plastic_strain(self, state: HistoryState) -> dict[Solid, Tensor]:
+        """Flow alpha [B, E] that the tetrahedra of every plastic solid have accumulated. Differentiable.
+
+        The sum of the norms of the log strains of flow in each step; sqrt(2/3) of it is the equivalent plastic strain.
+
+        Args:
+            state: a `HistoryState`.
+        """
+        self.check_state(state)
+        return plastic_strain(self.scene, state.history.flow) if self.keeps_history else {}
+
+    def membrane_stress(self, state: State | HistoryState | Tensor) -> dict[Cloth, MembraneStress]:
         """Cauchy stress [N/m] of every triangle by cloth, membrane and threads together, with its strain.
 
         A force per length of the present triangle, in the axes of its rest plane, which turn with it. Those axes are
@@ -173,7 +188,9 @@ class Readable(Model):
         positions, material = self._material_for(state, None)
         return membrane_stress(self.scene, positions, material)
 
-    def tensions(self, state: State | Tensor, targets: Targets | None = None) -> dict[Rod | Springs | Fibres, Tension]:
+    def tensions(
+        self, state: State | HistoryState | Tensor, targets: Targets | None = None
+    ) -> dict[Rod | Springs | Fibres, Tension]:
         """Tension and strain of every segment of rods, spring and fibre, by part.
 
         k (length - rest length) [N] for springs and segments. For fibres w (|F f| - L) [Pa], 0 where they are slack.
@@ -186,7 +203,7 @@ class Readable(Model):
         positions, material = self._material_for(state, targets)
         return tensions(self.scene, positions, material)
 
-    def volume(self, state: State | Tensor) -> dict[Body, Tensor]:
+    def volume(self, state: State | HistoryState | Tensor) -> dict[Body, Tensor]:
         """Volume [B] m^3 of every solid, and of every cloth that is closed. Differentiable.
 
         Inverted tetrahedra count as negative. A closed cloth has the volume that its triangles enclose, negative if
@@ -197,7 +214,9 @@ class Readable(Model):
         """
         return volumes(self.scene, self.positions_of(state))
 
-    def _material_for(self, state: State | Tensor, targets: Targets | None) -> tuple[Tensor, dict[str, Tensor]]:
+    def _material_for(
+        self, state: State | HistoryState | Tensor, targets: Targets | None
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         positions = self.positions_of(state)
         material = named_material(self.material_at(targets, len(positions)))
         check_environments("state", len(positions), material)
@@ -245,7 +264,7 @@ class Readable(Model):
             The path.
         """
 
-        def check(state: State) -> None:
+        def check(state: State | HistoryState) -> None:
             self.check_state(state)
             self.positions_of(state)
 

@@ -74,6 +74,8 @@ class RigidPieces:
         unknown = sorted({type(part).__name__ for part in sim.scene.parts if not isinstance(part, _KNOWN)})
         if any(not isinstance(solid.poisson, float) for solid in sim.scene.solids):
             unknown.append("a Poisson's ratio")
+        if sim.keeps_history:
+            unknown.append("plastic flow")
         if unknown:
             raise ValueError(
                 "RigidPieces: the scene must have nothing but solids without a Poisson's ratio, got "

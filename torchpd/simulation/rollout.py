@@ -14,7 +14,7 @@ from tqdm.auto import tqdm
 from ..common.checks import STEPS_DIFFER
 from ..plan.material import CORE_ROWS
 from ..scene.targets import Anchors, Targets
-from .state import Info, State, Track
+from .state import History, HistoryState, HistoryTrack, State, Track
 from .surface_loads import SurfaceLoads
 
 if TYPE_CHECKING:
@@ -39,19 +39,26 @@ class Steps(Protocol):
     @property
     def device(self) -> torch.device: ...
 
-    def check_state(self, state: State, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None: ...
+    @property
+    def keeps_history(self) -> bool: ...
+
+    def check_state(
+        self, state: State | HistoryState, *, forces: Tensor | None = None, fix: str = ""
+    ) -> Tensor | None: ...
 
     def material(self) -> list[Tensor]: ...
 
     def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]: ...
 
     def forces_at(
-        self, state: State, forces: Tensor | None, targets: Targets | None, material: list[Tensor]
+        self, state: State | HistoryState, forces: Tensor | None, targets: Targets | None, material: list[Tensor]
     ) -> Tensor | None: ...
+
+    def track(self, *found: Tensor) -> Track | HistoryTrack: ...
 
     def advance(
         self,
-        state: State,
+        state: State | HistoryState,
         forces: Tensor | None,
         material: list[Tensor],
         *,
@@ -59,14 +66,14 @@ class Steps(Protocol):
         every: int,
         inertial: bool,
         report: bool,
-    ) -> tuple[Tensor, Tensor, Tensor]: ...
+    ) -> tuple[Tensor, ...]: ...
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
     """Arguments of `Simulator.rollout`."""
 
-    state: State
+    state: State | HistoryState
     steps: int
     every: int
     forces: Tensor | PerStep | None
@@ -76,7 +83,7 @@ class Rollout:
     first: int  # number of the first step
 
 
-def run_rollout(sim: Steps, call: Rollout, *, progress: bool) -> Track:
+def run_rollout(sim: Steps, call: Rollout, *, progress: bool) -> Track | HistoryTrack:
     """Run a rollout and return the recorded states."""
     forces = sim.check_state(call.state, forces=None if _is_function(call.forces) else call.forces, fix=STEPS_DIFFER)
     material = _first_material(sim, call)
@@ -90,8 +97,7 @@ def run_rollout(sim: Steps, call: Rollout, *, progress: bool) -> Track:
         found = sim.advance(
             call.state, forces, material, steps=call.steps, every=call.every, inertial=call.inertial, report=call.report
         )
-    positions, velocities, rows = found
-    return Track(positions, velocities, Info.from_rows(rows))
+    return sim.track(*found)
 
 
 def _in_chunks(
@@ -129,7 +135,7 @@ def _in_chunks(
         )
         if recorded:
             chunks.append(chunk)
-        state, done = State(chunk[0][-1], chunk[1][-1]), done + steps
+        state, done = _reached(*chunk), done + steps
         if bar is not None:
             if adaptive and _finish(sim.device) - begin < _CHUNK_SECONDS:
                 size *= 2
@@ -139,9 +145,16 @@ def _in_chunks(
     return tuple(torch.cat(parts) for parts in zip(*chunks, strict=True))
 
 
+def _reached(positions: Tensor, velocities: Tensor, _rows: Tensor, *history: Tensor) -> State | HistoryState:
+    """The last state of a chunk."""
+    if not history:
+        return State(positions[-1], velocities[-1])
+    return HistoryState(positions[-1], velocities[-1], History(*(array[-1] for array in history)))
+
+
 def _changes(sim: Steps, call: Rollout) -> bool:
-    """Whether inputs change between steps: functions of the step number, and loads, which follow the state."""
-    return _is_function(call.forces) or _is_function(call.targets) or sim.loads is not None
+    """Whether inputs change between steps: functions of the step number, loads and history, which follow the state."""
+    return _is_function(call.forces) or _is_function(call.targets) or sim.loads is not None or sim.keeps_history
 
 
 def _is_function(given: Any) -> TypeIs[PerStep]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, overload
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, overload
 
 import torch
 from torch import Tensor
@@ -13,13 +14,14 @@ from ..common.reprs import by_sizes
 if TYPE_CHECKING:
     from ..scene.targets import Targets
 
-__all__ = ["Info", "State", "StepCall", "Track"]
+__all__ = ["History", "HistoryState", "HistoryTrack", "Info", "State", "StepCall", "Track"]
 
 
 class State(NamedTuple):
     """Positions and velocities of all vertices, in the order of the meshes, bodies one after another.
 
-    `torch.save` takes it, alone or in a checkpoint, and `torch.load` returns it where torchpd is imported.
+    `torch.save` takes it, alone or in a checkpoint, and `torch.load` returns it where torchpd is imported. Scenes with
+    plastic solids have a `HistoryState`.
     """
 
     positions: Tensor  # [B, V, 3] m
@@ -27,12 +29,11 @@ class State(NamedTuple):
 
     def to(self, *args: Any, **kwargs: Any) -> State:
         """The state on another device or in another precision, as `Tensor.to`."""
-        return State(self.positions.to(*args, **kwargs), self.velocities.to(*args, **kwargs))
+        return _mapped(self, lambda tensor: tensor.to(*args, **kwargs))
 
     def clone(self) -> State:
         """A contiguous copy, which `step_` may overwrite."""
-        dense = torch.contiguous_format
-        return State(self.positions.clone(memory_format=dense), self.velocities.clone(memory_format=dense))
+        return _mapped(self, _dense_copy)
 
     def where(self, condition: Tensor, other: State) -> State:
         """Take environments of this state where `condition` [B] is true, and of `other` elsewhere, for resets.
@@ -41,39 +42,105 @@ class State(NamedTuple):
             condition: bool [B].
             other: a state with as many environments, or with one for all.
         """
-        if not isinstance(condition, Tensor):
-            raise TypeError(f"State.where: condition must be a bool tensor, got {type(condition).__name__}")
-        if condition.dtype != torch.bool or condition.shape != self.positions.shape[:1]:
-            raise ValueError(
-                f"State.where: condition must be bool [{len(self.positions)}], one for each environment, got "
-                f"{condition.dtype} {list(condition.shape)}"
-            )
-        self._check_other(other)
-        chosen = condition[:, None, None]
-        pairs = zip(self, other, strict=True)
-        return State(*(torch.where(chosen, mine, theirs) for mine, theirs in pairs))
-
-    def _check_other(self, other: Any) -> None:
-        if not isinstance(other, (tuple, list)) or len(other) != 2:
-            raise TypeError(f"State.where: other must be a State, got {type(other).__name__}")
-        for name, mine, theirs in zip(self._fields, self, other, strict=True):
-            if theirs.dtype != mine.dtype or theirs.device != mine.device:
-                raise TypeError(
-                    f"State.where: other must have {name} {mine.dtype} on {mine.device}, got {theirs.dtype} on "
-                    f"{theirs.device}"
-                )
-            if theirs.shape not in (mine.shape, (1, *mine.shape[1:])):
-                raise ValueError(
-                    f"State.where: other must have {name} {list(mine.shape)}, or those of one environment, got "
-                    f"{list(theirs.shape)}"
-                )
+        return _where(self, condition, other)
 
     def detach(self) -> State:
         """The state without its autograd history, as `Tensor.detach`."""
-        return State(self.positions.detach(), self.velocities.detach())
+        return _mapped(self, Tensor.detach)
 
     def __repr__(self) -> str:
         return by_sizes(self, self.positions, "batch", "vertices")
+
+
+class History(NamedTuple):
+    """What a step leaves for the next one, besides positions and velocities."""
+
+    flow: Tensor  # [B, P, 10] of plastic tetrahedra: Fp, row by row, and alpha (see `Plastic`)
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.flow, "batch", "plastic", trailing=1)
+
+
+class HistoryState(NamedTuple):
+    """The state of a scene with plastic solids: positions, velocities and history.
+
+    `Simulator.rest_state` makes one; steps take and return it as scenes without history do a `State`. For a state of
+    one's own: `HistoryState(x, v, sim.rest_state(len(x)).history)`.
+    """
+
+    positions: Tensor  # [B, V, 3] m
+    velocities: Tensor  # [B, V, 3] m/s
+    history: History
+
+    def to(self, *args: Any, **kwargs: Any) -> HistoryState:
+        """The state on another device or in another precision, as `Tensor.to`."""
+        return _mapped(self, lambda tensor: tensor.to(*args, **kwargs))
+
+    def clone(self) -> HistoryState:
+        """A contiguous copy, which `step_` may overwrite."""
+        return _mapped(self, _dense_copy)
+
+    def where(self, condition: Tensor, other: HistoryState) -> HistoryState:
+        """Take environments of this state where `condition` [B] is true, of `other` elsewhere, see `State.where`."""
+        return _where(self, condition, other)
+
+    def detach(self) -> HistoryState:
+        """The state without its autograd history, as `Tensor.detach`."""
+        return _mapped(self, Tensor.detach)
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "batch", "vertices")
+
+
+_AnyState = TypeVar("_AnyState", State, HistoryState)
+_Some = TypeVar("_Some", bound=State | HistoryState)
+
+
+def _mapped(state: _Some, function: Callable[[Tensor], Tensor]) -> _Some:
+    """The state with a function applied to each of its tensors."""
+    whole: tuple[Any, ...] = state
+    kind: Callable[..., _Some] = type(state)
+    return kind(*(function(part) if isinstance(part, Tensor) else History(*map(function, part)) for part in whole))
+
+
+def _dense_copy(tensor: Tensor) -> Tensor:
+    return tensor.clone(memory_format=torch.contiguous_format)
+
+
+def _named(state: State | HistoryState) -> dict[str, Tensor]:
+    """The tensors of a state by name."""
+    named = {"positions": state.positions, "velocities": state.velocities}
+    return named | state.history._asdict() if isinstance(state, HistoryState) else named
+
+
+def _where(state: _Some, condition: Any, other: Any) -> _Some:
+    """Implementation of `State.where` and `HistoryState.where`."""
+    kind = type(state)
+    if not isinstance(condition, Tensor):
+        raise TypeError(f"{kind.__name__}.where: condition must be a bool tensor, got {type(condition).__name__}")
+    if condition.dtype != torch.bool or condition.shape != state.positions.shape[:1]:
+        raise ValueError(
+            f"{kind.__name__}.where: condition must be bool [{len(state.positions)}], one for each environment, got "
+            f"{condition.dtype} {list(condition.shape)}"
+        )
+    if not isinstance(other, (tuple, list)) or len(other) != len(state):
+        raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__}, got {type(other).__name__}")
+    theirs_of = _named(kind(*other))
+    for name, mine in _named(state).items():
+        theirs = theirs_of[name]
+        if theirs.dtype != mine.dtype or theirs.device != mine.device:
+            raise TypeError(
+                f"{kind.__name__}.where: other must have {name} {mine.dtype} on {mine.device}, got {theirs.dtype} on "
+                f"{theirs.device}"
+            )
+        if theirs.shape not in (mine.shape, (1, *mine.shape[1:])):
+            raise ValueError(
+                f"{kind.__name__}.where: other must have {name} {list(mine.shape)}, or those of one environment, got "
+                f"{list(theirs.shape)}"
+            )
+    chosen = condition[:, None, None]
+    rest = iter(theirs_of.values())
+    return _mapped(state, lambda mine: torch.where(chosen, mine, next(rest)))
 
 
 class Info(NamedTuple):
@@ -134,33 +201,33 @@ class StepCall(Protocol):
     @overload
     def __call__(
         self,
-        state: State,
+        state: _AnyState,
         forces: Tensor | None = None,
         targets: Targets | None = None,
         start: str | Tensor = "velocity",
         return_info: Literal[False] = False,
-    ) -> State: ...
+    ) -> _AnyState: ...
 
     @overload
     def __call__(
         self,
-        state: State,
+        state: _AnyState,
         forces: Tensor | None = None,
         targets: Targets | None = None,
         start: str | Tensor = "velocity",
         *,
         return_info: Literal[True],
-    ) -> tuple[State, Info]: ...
+    ) -> tuple[_AnyState, Info]: ...
 
     @overload
     def __call__(
         self,
-        state: State,
+        state: _AnyState,
         forces: Tensor | None = None,
         targets: Targets | None = None,
         start: str | Tensor = "velocity",
         return_info: bool = False,
-    ) -> State | tuple[State, Info]: ...
+    ) -> _AnyState | tuple[_AnyState, Info]: ...
 
 
 class Track(NamedTuple):
@@ -172,20 +239,39 @@ class Track(NamedTuple):
 
     def state(self, record: int = -1) -> State:
         """One record as a state to continue from."""
-        try:
-            return State(self.positions[record], self.velocities[record])
-        except IndexError:
-            count = len(self.positions)
-            there = (
-                f"record must lie in {-count}..{count - 1}" if count else "the track has no record, steps // every is 0"
-            )
-            raise IndexError(f"Track.state: {there}, got {record}") from None
+        return State(*_record(self, record, self.positions, self.velocities))
 
     def __repr__(self) -> str:
         return by_sizes(self, self.positions, "records", "batch", "vertices")
 
 
-for _kind in (Info, State, Track):
+class HistoryTrack(NamedTuple):
+    """Recorded states of a rollout of a scene with plastic solids, without its start."""
+
+    positions: Tensor  # [T, B, V, 3] m
+    velocities: Tensor  # [T, B, V, 3] m/s
+    info: Info  # [T, B], of the last step before each record
+    history: History  # [T, B, ...]
+
+    def state(self, record: int = -1) -> HistoryState:
+        """One record as a state to continue from."""
+        positions, velocities, *history = _record(self, record, self.positions, self.velocities, *self.history)
+        return HistoryState(positions, velocities, History(*history))
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.positions, "records", "batch", "vertices")
+
+
+def _record(track: Track | HistoryTrack, record: int, *arrays: Tensor) -> list[Tensor]:
+    try:
+        return [array[record] for array in arrays]
+    except IndexError:
+        count = len(arrays[0])
+        there = f"record must lie in {-count}..{count - 1}" if count else "the track has no record, steps // every is 0"
+        raise IndexError(f"{type(track).__name__}.state: {there}, got {record}") from None
+
+
+for _kind in (Info, State, Track, History, HistoryState, HistoryTrack):
     # pickles name a class by its module: now torchpd, formerly torchpd.state
     _kind.__module__ = "torchpd"
     # allow-lists of torch.load and torch.export.save; these classes hold tensors and run nothing

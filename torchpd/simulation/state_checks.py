@@ -15,7 +15,7 @@ from torch import Tensor
 from ..common.checks import check_like, check_whole, expand_shared, to_full_precision
 from ..common.warn import warn_user
 from ..scene.scene import Scene
-from .state import State
+from .state import History, HistoryState, State
 
 __all__ = [
     "ADJOINTS",
@@ -116,17 +116,20 @@ def _number_or_nan(value: Any) -> float:
         return math.nan
 
 
-def check_state(rest: Tensor, state: State, *, forces: Tensor | None, fix: str) -> Tensor | None:
-    """Implementation of `Model.check_state`, by the rest positions [V, 3] of a simulator."""
-    if not _is_pair(state):
+def check_state(
+    rest: Tensor, state: State | HistoryState, history: History | None, *, forces: Tensor | None, fix: str
+) -> Tensor | None:
+    """Implementation of `Model.check_state`, by the rest positions [V, 3] and history [n, ...] of a simulator."""
+    if not _is_state(state, history):
         raise TypeError(
-            f"state must be a State, positions and velocities [B, {len(rest)}, 3], got "
+            f"state must be {_wanted(history)}, positions and velocities [B, {len(rest)}, 3], got "
             f"{_kind_of(state)}; rest_state() makes one"
         )
     _check_kind(rest, "state", state[0])
     if state[0].dim() == 0:  # the batch is read before an op checks the shape
         raise ValueError(f"positions must be [B, {len(rest)}, 3], got []")
     check_like("velocities", state[1], state[0], "m/s")
+    _check_history(rest, state, history)
     if forces is None:
         return None
     forces = expand_shared(to_full_precision(forces, state[0]), state[0].shape)
@@ -134,21 +137,33 @@ def check_state(rest: Tensor, state: State, *, forces: Tensor | None, fix: str) 
     return forces
 
 
-def positions_of(rest: Tensor, state: State | Tensor, name: str) -> Tensor:
-    """Implementation of `Model.positions_of`, by the rest positions [V, 3] of a simulator."""
+def positions_of(rest: Tensor, state: State | HistoryState | Tensor, history: History | None, name: str) -> Tensor:
+    """Implementation of `Model.positions_of`, by the rest positions [V, 3] and history [n, ...] of a simulator."""
     alone = isinstance(state, Tensor)
-    if not (alone or _is_pair(state)):
+    if not (alone or _is_state(state, history)):
         raise TypeError(
-            f"{name} must be a State, positions and velocities [B, {len(rest)}, 3], or positions alone, got "
+            f"{name} must be {_wanted(history)}, positions and velocities [B, {len(rest)}, 3], or positions alone, got "
             f"{_kind_of(state)}"
         )
     positions = state if isinstance(state, Tensor) else state[0]
     _check_kind(rest, name, positions)
     if positions.dim() != 3 or positions.shape[1:] != rest.shape:
         raise ValueError(f"{name} must be [B, {len(rest)}, 3], got {list(positions.shape)}")
-    if not alone:
+    if not isinstance(state, Tensor):
         check_like("velocities", state[1], positions, "m/s")
+        _check_history(rest, state, history)
     return positions
+
+
+def _check_history(rest: Tensor, state: State | HistoryState, history: History | None) -> None:
+    if history is None:
+        return
+    given = History(*state[2])  # type: ignore[misc]
+    for name, own, array in zip(history._fields, history, given, strict=True):
+        _check_kind(rest, f"history.{name}", array)
+        shape = (len(state[0]), *own.shape[-2:])
+        if array.shape != shape:
+            raise ValueError(f"history.{name} must be {list(shape)}, as rest_state() has it, got {list(array.shape)}")
 
 
 def _check_kind(own: Tensor, name: str, positions: Tensor) -> None:
@@ -159,9 +174,20 @@ def _check_kind(own: Tensor, name: str, positions: Tensor) -> None:
         )
 
 
-def _is_pair(state: Any) -> bool:
-    pair = isinstance(state, (tuple, list)) and len(state) == 2
-    return pair and isinstance(state[0], Tensor) and isinstance(state[1], Tensor)
+def _wanted(history: History | None) -> str:
+    return "a State" if history is None else "a HistoryState, in a scene with plastic solids"
+
+
+def _is_state(state: Any, history: History | None) -> bool:
+    count = 2 if history is None else 3
+    if not (isinstance(state, (tuple, list)) and len(state) == count):
+        return False
+    own = history is None or (
+        isinstance(state[2], (tuple, list))
+        and len(state[2]) == len(history)
+        and all(isinstance(array, Tensor) for array in state[2])
+    )
+    return own and isinstance(state[0], Tensor) and isinstance(state[1], Tensor)
 
 
 def _kind_of(value: object) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -15,7 +17,7 @@ from ..plan.material import environments_of_material, named_arrays
 from ..scene.targets import Targets
 from .readable import Readable
 from .rollout import PerStep, Rollout, run_rollout
-from .state import Info, State, StepCall, Track
+from .state import History, HistoryState, HistoryTrack, Info, State, StepCall, Track
 
 __all__ = ["Stepper"]
 
@@ -30,8 +32,10 @@ class Stepper(Readable):
     # ---- states
 
     @check_arguments("Simulator.rest_state")
-    def rest_state(self, batch: int | None = None) -> State:
-        """The rest positions with zero velocities [batch, V, 3].
+    def rest_state(self, batch: int | None = None) -> Any:
+        """The rest positions with zero velocities [batch, V, 3], and the history of a scene that keeps one.
+
+        A `State`, or a `HistoryState` in scenes with plastic solids.
 
         Args:
             batch: environments; by default one for each environment of the material.
@@ -41,16 +45,27 @@ class Stepper(Readable):
         )
         shape = (count, -1, -1)
         positions = self.rest_positions.expand(shape).clone()
-        return State(positions, torch.zeros_like(positions))
+        state = State(positions, torch.zeros_like(positions))
+        history = self.history_at_rest()
+        if history is None:
+            return state
+        return HistoryState(*state, History(*(array.expand(count, *array.shape[-2:]).clone() for array in history)))
+
+    def _after(self, positions: Tensor, velocities: Tensor, material: list[Tensor]) -> Any:
+        """The state after a step with this material."""
+        if not self.keeps_history:
+            return State(positions, velocities)
+        kept = _ops.next_history(positions, material, list(self.plan.arrays), time_step=self.time_step)
+        return HistoryState(positions, velocities, History(*kept))
 
     def forward(
         self,
-        state: State,
+        state: State | HistoryState,
         forces: Tensor | None = None,
         targets: Targets | None = None,
         start: str | Tensor = "velocity",
         return_info: bool = False,
-    ) -> State | tuple[State, Info]:
+    ) -> Any:
         """Advance a state by one time step.
 
         `torch.autocast` changes no result; within it, forces may have half precision.
@@ -60,7 +75,7 @@ class Stepper(Readable):
         `torch.func.grad` are not provided.
 
         Args:
-            state: positions and velocities [B, V, 3] [m, m/s].
+            state: positions and velocities [B, V, 3] [m, m/s]; in scenes with plastic solids a `HistoryState`.
             forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant in the step.
             targets: of pins and spheres at the end of the step [m], by part; or one tensor [P, 3] or [B, P, 3] for all
                 pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
@@ -75,11 +90,11 @@ class Stepper(Readable):
             The next state, or (state, info).
         """
         forces = self.check_state(state, forces=forces)
-        material = self.material_at(targets, state[0].shape[0])
+        material = self.with_history(self.material_at(targets, state[0].shape[0]), state)
         if self.loads is not None:
             forces = self.forces_at(state, forces, targets, material)
         given, inertial = _first_iterate(start, state[0])
-        refuse_forward_mode(*state, forces, *material)
+        refuse_forward_mode(state[0], state[1], forces, *material)
         self._notices.before(self, state, material, self.time_step, report=return_info)
         positions, velocities, rows = _ops.step(
             state[0],
@@ -90,7 +105,7 @@ class Stepper(Readable):
             list(self.plan.arrays),
             **self.step_settings(inertial=inertial, report=return_info),
         )
-        after = State(positions, velocities)
+        after = self._after(positions, velocities, material)
         if not return_info:
             return after
         self._notices.after(self, positions, rows)
@@ -99,7 +114,7 @@ class Stepper(Readable):
     @torch.no_grad()
     def step_(
         self,
-        state: State,
+        state: State | HistoryState,
         forces: Tensor | None = None,
         targets: Targets | None = None,
         start: str | Tensor = "velocity",
@@ -114,7 +129,7 @@ class Stepper(Readable):
             info: rows [B, 7] float64 to fill in, see `Info.from_rows`; None leaves out residual, energy and inverted.
         """
         forces = self.check_state(state, forces=forces)
-        if state[0].requires_grad or state[1].requires_grad:
+        if _requires_grad(state[0], state[1], *(state[2] if len(state) > 2 else ())):
             raise ValueError(
                 "step_: state must not require gradients, because it is overwritten; detach it or call the simulator"
             )
@@ -124,7 +139,7 @@ class Stepper(Readable):
                 f"{type(info).__name__}"
             )
         given, inertial = _first_iterate(start, state[0])
-        material = self.material_at(targets, state[0].shape[0])
+        material = self.with_history(self.material_at(targets, state[0].shape[0]), state)
         if self.loads is not None:
             forces = self.forces_at(state, forces, targets, material)
         self._notices.before(self, state, material, self.time_step, report=info is not None)
@@ -139,13 +154,16 @@ class Stepper(Readable):
             list(self.plan.arrays),
             **self.step_settings(inertial=inertial, report=info is not None),
         )
+        if isinstance(state, HistoryState) or len(state) > 2:
+            for kept, new in zip(state[2], self._after(state[0], state[1], material).history, strict=True):
+                kept.copy_(new)
         if info is not None:
             self._notices.after(self, state[0], info)
 
     @check_arguments("Simulator.rollout")
     def rollout(
         self,
-        state: State,
+        state: State | HistoryState,
         steps: int,
         every: int = 1,
         *,
@@ -155,10 +173,11 @@ class Stepper(Readable):
         start: str = "velocity",
         return_info: bool = False,
         progress: bool = False,
-    ) -> Track:
+    ) -> Any:
         """Advance a state by many time steps and record some of them.
 
-        A scene with pressure or wind takes step by step, with the forces at the start of each.
+        A scene with pressure or wind takes step by step, with the forces at the start of each. So does a scene with
+        plastic solids, whose track is a `HistoryTrack`.
 
         A constant target of a sphere with a velocity moves on with it. If a function gives centres without velocities,
         these are the displacements since the step before. The sphere then starts from its place in the scene, at step 0
@@ -191,7 +210,7 @@ class Stepper(Readable):
 
     def advance(
         self,
-        state: State,
+        state: State | HistoryState,
         forces: Tensor | None,
         material: list[Tensor],
         *,
@@ -199,16 +218,19 @@ class Stepper(Readable):
         every: int,
         inertial: bool,
         report: bool,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         """Take steps from a checked state and forces in one call of the op; spheres start where `material` has them.
 
         Returns:
-            Positions and velocities [steps // every, B, V, 3], and rows for `Info.from_rows`.
+            Positions and velocities [steps // every, B, V, 3], rows for `Info.from_rows`, and those of the history.
         """
-        refuse_forward_mode(*state, forces, *material)
+        material = self.with_history(material, state)
+        refuse_forward_mode(state[0], state[1], forces, *material)
         self._notices.before(self, state, material, self.time_step, report=report)
+        if self.keeps_history:
+            return self._advance_once(state, forces, material, steps=steps, inertial=inertial, report=report)
         # the adjoint needs every state, so the op has a derivative only with every=1
-        thinned = every > 1 and torch.is_grad_enabled() and _requires_grad(*state, forces, *material)
+        thinned = every > 1 and torch.is_grad_enabled() and _requires_grad(state[0], state[1], forces, *material)
         found = _ops.rollout(
             state[0],
             state[1],
@@ -228,21 +250,49 @@ class Stepper(Readable):
                 self._notices.after(self, reached, row)
         return positions, velocities, rows
 
+    def _advance_once(
+        self,
+        state: State | HistoryState,
+        forces: Tensor | None,
+        material: list[Tensor],
+        *,
+        steps: int,
+        inertial: bool,
+        report: bool,
+    ) -> tuple[Tensor, ...]:
+        """`advance` in a scene that keeps a history: one step, or none."""
+        settings = self.step_settings(inertial=inertial, report=report)
+        positions, velocities, rows = _ops.step(
+            state[0], state[1], forces, None, material, list(self.plan.arrays), **settings
+        )
+        if report and not torch.compiler.is_compiling():
+            self._notices.after(self, positions, rows)
+        kept = self._after(positions, velocities, material).history
+        return tuple(array[None][:steps] for array in (positions, velocities, rows, *kept))
+
+    def track(self, *found: Tensor) -> Track | HistoryTrack:
+        """The track of what `advance` returned."""
+        positions, velocities, rows, *history = found
+        info = Info.from_rows(rows)
+        if not history:
+            return Track(positions, velocities, info)
+        return HistoryTrack(positions, velocities, info, History(*history))
+
     # ---- energies
 
-    def energy(self, state: State | Tensor, targets: Targets | None = None) -> Tensor:
+    def energy(self, state: State | HistoryState | Tensor, targets: Targets | None = None) -> Tensor:
         """Mechanical energy of each environment [B] [J], differentiable twice.
 
         Elastic energy, springs of soft pins, weight (zero at the origin) and, for a `State`, kinetic energy. It leaves
         out pressure and wind, which are forces of a step.
 
         Args:
-            state: a `State`, or positions [B, V, 3] alone.
+            state: a `State`, or positions [B, V, 3] alone; these have the flow of a new state in plastic solids.
             targets: of pins and fibres, as in `forward`.
         """
         positions = self.positions_of(state)
         refuse_forward_mode(positions)
-        arrays = self.material_at(targets, positions.shape[0])
+        arrays = self.with_history(self.material_at(targets, positions.shape[0]), state)
         material, elastic, plan = named_material(arrays), elastic_material(arrays), list(self.plan.arrays)
         energy = elastic_energy(positions, elastic, plan)
         weight = (positions * material["gravity"].unsqueeze(-2)).sum(-1)
@@ -258,18 +308,23 @@ class Stepper(Readable):
         soft = torch.where(torch.isinf(stiffness), torch.zeros_like(stiffness), stiffness)
         return 0.5 * (soft * (positions[:, vertices] - targets).square().sum(-1)).sum(-1)
 
-    def gradient(self, positions: State | Tensor) -> Tensor:
+    def gradient(self, positions: State | HistoryState | Tensor) -> Tensor:
         """Gradient of the elastic energy [B, V, 3] [N], the negative of the elastic forces.
 
         Args:
             positions: [B, V, 3], or a `State`.
         """
-        positions = self.positions_of(positions, "positions")
-        result: Tensor = _ops.gradient(positions, elastic_material(self.material()), list(self.plan.arrays))
+        at = self.positions_of(positions, "positions")
+        material = elastic_material(self.with_history(self.material(), positions))
+        result: Tensor = _ops.gradient(at, material, list(self.plan.arrays))
         return result
 
     def step_gradient(
-        self, state: State, after: State | Tensor, forces: Tensor | None = None, targets: Targets | None = None
+        self,
+        state: State | HistoryState,
+        after: State | HistoryState | Tensor,
+        forces: Tensor | None = None,
+        targets: Targets | None = None,
     ) -> Tensor:
         """Gradient [B, V, 3] [N] of a step's objective at given positions; a solve drives it to zero.
 

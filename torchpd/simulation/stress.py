@@ -7,6 +7,8 @@ of R : (F - R) over the tetrahedron's group. So the first Piola-Kirchhoff stress
 
     sigma = P F^T / det F.
 
+A plastic tetrahedron has the stress of the elastic part F Fp^-1 of F, and the strain of F.
+
 All are constant in a tetrahedron. In a partly full tetrahedron (`mesh.fill`) the stress is that of its average
 material.
 """
@@ -22,11 +24,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.reprs import by_sizes
-from ..common.small_matrices import dot, product, root
+from ..common.small_matrices import dot, inverse, product, root
 from ..ops.registration import nearest_rotation
+from ..scene.effects import Solid
 from ..scene.scene import Scene
 
-__all__ = ["Stress", "has_stress", "stress", "vertex_average"]
+__all__ = ["STRESS_ROWS", "Stress", "has_stress", "plastic_strain", "stress", "vertex_average"]
+
+# arrays of the material that `stress` takes, those that a scene has
+STRESS_ROWS = ("stiffness", "poisson", "plastic_youngs", "plastic_poisson", "flow")
 
 
 class Stress(NamedTuple):
@@ -86,11 +92,21 @@ def _rest(scene: Scene, device: torch.device, dtype: torch.dtype) -> _Rest:
         whole = (torch.from_numpy(array).to(device) for array in (tets, tet, counts))
         real = (torch.from_numpy(array).to(device, dtype) for array in (np.linalg.inv(edges), shares))
         (corner, tet_of, count), (inverse_edges, share) = whole, real
-        has_poisson = any(not isinstance(solid.poisson, float) for solid in scene.solids)
-        numbers = scene.values().tet_group if has_poisson else None
-        groups = _groups(numbers, np.linalg.det(edges) / 6.0, device, dtype)
+        groups = _groups(_averaging_groups(scene), np.linalg.det(edges) / 6.0, device, dtype)
         kept[device, dtype] = _Rest(corner, inverse_edges, tet_of, count, share, groups)
     return kept[device, dtype]
+
+
+def _averaging_groups(scene: Scene) -> NDArray[np.int64] | None:
+    """Group of each tetrahedron [E], of a plastic one alone; None without Poisson's ratios."""
+    if all(isinstance(solid.poisson, float) and solid.plastic is None for solid in scene.solids):
+        return None
+    groups, count = [], 0
+    for solid in scene.solids:
+        own = solid.averaging_groups if solid.plastic is None else np.arange(len(solid.mesh.tets))
+        groups.append(own + count)
+        count = int(groups[-1].max()) + 1
+    return np.concatenate(groups)
 
 
 def _groups(
@@ -118,8 +134,35 @@ def has_stress(scene: Scene) -> bool:
     return all(solid.law == "corotated" and solid.strain_limit is None for solid in scene.solids)
 
 
-def stress(scene: Scene, positions: Tensor, stiffness: Tensor, poisson: Tensor | None = None) -> Stress:
-    """Implementation of `Simulator.stress` for checked positions [B, V, 3], stiffness and `poisson` [E] or [B, E]."""
+def _with_plastic(scene: Scene, elastic: Tensor, plastic: Tensor, dims: int) -> Tensor:
+    """Rows [B, E, ...] of all tetrahedra, solid by solid, from those of elastic and of plastic solids.
+
+    `dims`: dimensions without a batch.
+    """
+    batched = [rows if rows.dim() > dims else rows[None] for rows in (elastic, plastic)]
+    batch = max(map(len, batched))
+    of, starts, parts = [rows.expand(batch, *rows.shape[1:]) for rows in batched], [0, 0], []
+    for solid in scene.solids:
+        which, count = int(solid.plastic is not None), len(solid.mesh.tets)
+        parts.append(of[which][:, starts[which] : starts[which] + count])
+        starts[which] += count
+    return torch.cat(parts, dim=1)
+
+
+def plastic_strain(scene: Scene, flow: Tensor) -> dict[Solid, Tensor]:
+    """Implementation of `Simulator.plastic_strain` for checked flow [B, P, 10]."""
+    found: dict[Solid, Tensor] = {}
+    first = 0
+    for solid in scene.solids:
+        if solid.plastic is not None:
+            count = len(solid.mesh.tets)
+            found[solid] = flow[:, first : first + count, 9]
+            first += count
+    return found
+
+
+def stress(scene: Scene, positions: Tensor, material: dict[str, Tensor]) -> Stress:
+    """Implementation of `Simulator.stress` for checked positions [B, V, 3] and arrays of `STRESS_ROWS`."""
     if not has_stress(scene):
         raise ValueError(
             'stress: every solid must have law="corotated" and no strain_limit, whose stress is not provided, got '
@@ -135,6 +178,14 @@ def stress(scene: Scene, positions: Tensor, stiffness: Tensor, poisson: Tensor |
     inverted = ~(determinant.detach() > 0.0)
     # so that no NaN reaches the derivatives of the others
     lost = inverted[..., None, None]
+    stiffness, poisson = material["stiffness"], material.get("poisson")
+    if "flow" in material:
+        whole = identity.expand(len(stiffness.movedim(-1, 0)), 3, 3)
+        plastic = material["flow"][..., :9].unflatten(-1, (3, 3))
+        F = product(F, inverse(_with_plastic(scene, whole, plastic, 3)))
+        poisson = torch.zeros_like(stiffness) if poisson is None else poisson
+        stiffness = _with_plastic(scene, stiffness, material["plastic_youngs"], 1)
+        poisson = _with_plastic(scene, poisson, material["plastic_poisson"], 1)
     actual, F = F, torch.where(lost, identity, F)
     R = nearest_rotation(F)
     volume = torch.where(inverted, 1.0, determinant)

@@ -45,20 +45,20 @@ from ..scene.fibres import Fibres
 from ..scene.part import Body
 from ..scene.scene import Scene
 from ..scene.springs import Springs
-from .state import State, Track
+from .state import HistoryState, HistoryTrack, State, Track
 from .stencil_readouts import forces_on_tied, has_membrane_stress, membrane_stress, tensions
-from .stress import has_stress, stress
+from .stress import STRESS_ROWS, has_stress, plastic_strain, stress
 
 __all__ = ["States", "write_vtu"]
 
-States = State | Track | Sequence[State]
+States = State | HistoryState | Track | HistoryTrack | Sequence[State | HistoryState]
 Fields = dict[str, NDArray[Any]]
 Index = NDArray[np.int64]
 
 
 def write_vtu(
     compiled: CompiledScene,
-    check: Callable[[State], object],
+    check: Callable[[State | HistoryState], object],
     path: str | Path,
     states: States,
     environment: int | None,
@@ -96,11 +96,14 @@ def write_vtu(
 # ---- what is written
 
 
-def _records(compiled: CompiledScene, check: Callable[[State], object], states: States) -> tuple[list[State], bool]:
+def _records(
+    compiled: CompiledScene, check: Callable[[State | HistoryState], object], states: States
+) -> tuple[list[State | HistoryState], bool]:
     """The states one by one, and whether a single one was given."""
     alone = False
-    if isinstance(states, Track):
-        found = [State(x, v) for x, v in zip(states.positions, states.velocities, strict=True)]
+    found: list[State | HistoryState]
+    if isinstance(states, Track | HistoryTrack):
+        found = [states.state(record) for record in range(len(states.positions))]
     elif isinstance(states, (tuple, list)):
         alone = len(states) > 0 and isinstance(states[0], Tensor)
         found = [states] if alone else list(states)  # type: ignore[list-item]
@@ -118,7 +121,7 @@ def _records(compiled: CompiledScene, check: Callable[[State], object], states: 
     names = {"stiffness", *(row.name for row in EFFECT_ROWS)} & compiled.named.keys()
     elastic = {name: compiled.named[name] for name in sorted(names)}
     check_environments("write_vtu: states", len(found[0][0]), elastic)
-    return [State(*state) for state in found], alone
+    return [HistoryState(*state) if len(state) > 2 else State(*state) for state in found], alone
 
 
 def _chosen(environment: int | None, batch: int) -> int:
@@ -179,18 +182,28 @@ def _spread(cells: Mapping[str, Index], kind: str, values: NDArray[Any]) -> NDAr
 
 @torch.no_grad()
 def _own_fields(
-    compiled: CompiledScene, state: State, chosen: int
+    compiled: CompiledScene, state: State | HistoryState, chosen: int
 ) -> tuple[Fields, dict[str, tuple[str, NDArray[Any]]]]:
     """Fields of points that files have, and those of cells with the kind that has them."""
     scene, positions = compiled.scene, state.positions[chosen]
-    material = {name: _of_environment(name, array, chosen) for name, array in compiled.named.items()}
+    named = dict(compiled.named)
+    if isinstance(state, HistoryState):
+        named |= state.history._asdict()
+    material = {name: _of_environment(name, array, chosen) for name, array in named.items()}
     rest = positions.new_tensor(scene.rest_positions)
     points = {"displacement": positions - rest, "velocity": state.velocities[chosen]}
     cells: dict[str, tuple[str, Tensor]] = {}
     if scene.solids and has_stress(scene):
-        found = stress(scene, positions[None], material["stiffness"], material.get("poisson"))
+        given = {name: material[name] for name in STRESS_ROWS if name in material}
+        rows = {name: row for name, row in given.items() if name == "stiffness" or row.numel() > 0}
+        found = stress(scene, positions[None], rows)
         cells["stress"] = "tetra", found.cauchy[0].flatten(1)
         cells["von_mises"] = "tetra", found.von_mises[0]
+    if isinstance(state, HistoryState):
+        flows = plastic_strain(scene, state.history.flow[chosen][None])
+        none = [positions.new_zeros(len(solid.mesh.tets)) for solid in scene.solids]
+        own = [flows[solid][0] if solid in flows else zeros for solid, zeros in zip(scene.solids, none, strict=True)]
+        cells["plastic_strain"] = "tetra", torch.cat(own)
     sheets = membrane_stress(scene, positions[None], material) if has_membrane_stress(scene) else {}
     if sheets:
         cells["membrane_stress"] = "triangle", torch.cat([sheet.principal[0] for sheet in sheets.values()])

@@ -68,7 +68,7 @@ def _beam_scene(mesh: TetMesh, youngs: float, poisson: float = 0.0) -> Scene:
 
 
 def _beam_start(sim: Simulator) -> State:
-    state = sim.rest_state()
+    state: State = sim.rest_state()
     state.velocities[..., 1] = -10.0 * state.positions[..., 0] ** 2
     return state
 
@@ -126,7 +126,7 @@ def _landing_scene(mesh: TetMesh, youngs: float, poisson: float = 0.0) -> Scene:
 
 
 def _landing_start(sim: Simulator) -> State:
-    state = sim.rest_state()
+    state: State = sim.rest_state()
     state.velocities[:] = torch.tensor(_LANDING, dtype=sim.dtype, device=sim.device)
     return state
 
@@ -137,7 +137,7 @@ def _held_scene(mesh: TetMesh, youngs: float, poisson: float = 0.0) -> Scene:
 
 
 def _held_start(sim: Simulator) -> State:
-    state = sim.rest_state()
+    state: State = sim.rest_state()
     state.velocities[..., 0] = _SWING * _above_held(state.positions[..., 1]).clip(0.0) ** 2
     return state
 

@@ -43,6 +43,12 @@ class FieldPass {
       vertex_field<2, 3>(environment, Elements{none, Dissipating<StencilHessian>{}});
     } else if (call_.field == Field::damping_start) {
       differentiate_by_start(environment);
+    } else if (call_.field == Field::next_history) {
+      each_history([&](auto kind, const StencilPart<T>& part) {
+        keep_history<decltype(kind)>(environment, part);
+      });
+    } else if (call_.field == Field::next_history_product) {
+      differentiate_history(environment);
     } else if (call_.field == Field::element_energy) {
       element_field<1, 1>(environment, ElementEnergy{});
     } else if (call_.field == Field::element_energy_product) {
@@ -174,6 +180,91 @@ class FieldPass {
                                         sweep_.template measure<Kind>(part), f, df, c, memory);
         out[i] = out[i] + (call_.direction ? by.product : by.energy);
       }
+    }
+  }
+
+  // visit(kind, part) for every stencil that keeps a history, lane by lane, with padding; the slots stand in the scratch.
+  template <class Visit>
+  void each_history(const Visit& visit) {
+    for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
+      sweep_.template gather_slots<1>(patch);
+      each_stencil<Batch<T, 1>>(plan_, patch, [&](auto kind, const StencilPart<T>& part) {
+        if constexpr (history_of<decltype(kind)> > 0) visit(kind, part);
+      });
+    }
+    team_.barrier();
+  }
+
+  // F and the rows of a stencil
+  template <class Kind>
+  void read_stencil(std::int64_t environment, const StencilPart<T>& part, Vec3<T> (&f)[Kind::dims],
+                    T (&row)[Kind::rows]) const {
+    T g[gradient_numbers<Kind>];
+    Vec3<T> x[Kind::corners];
+    for (int i = 0; i < gradient_numbers<Kind>; ++i) g[i] = *part.stored(i);
+    for (int a = 0; a < Kind::corners; ++a) x[a] = to_vec3(scratch_.x[*part.corner(a)]);
+    deform<Kind>(x, g, f);
+    MaterialRows<Kind, T>(call_.effects, environment)
+        .values(plan_.stencil_row[part.stencil()], row);
+  }
+
+  // Number of a stencil of a kind among those of all environments.
+  template <class Kind>
+  std::int64_t place_of(std::int64_t environment, const StencilPart<T>& part) const {
+    return environment * plan_.stencil_sizes[stencil_size_count + kind_number<Kind>] +
+           plan_.stencil_row[part.stencil()];
+  }
+
+  template <class Kind>
+  void keep_history(std::int64_t environment, const StencilPart<T>& part) const {
+    if (plan_.stencil_measure[part.stencil()] == T(0)) return;
+    Vec3<T> f[Kind::dims];
+    T row[Kind::rows] = {}, next[Kind::history];
+    read_stencil<Kind>(environment, part, f, row);
+    Kind::finish(f, row, T(1) / call_.per_time, next);
+    T* out =
+        call_.products[history_effect<Kind>] + place_of<Kind>(environment, part) * Kind::history;
+    for (int i = 0; i < Kind::history; ++i) out[i] = next[i];
+  }
+
+  // First by the stress of each stencil, which stands in place of its numbers, then by the positions.
+  void differentiate_history(std::int64_t environment) {
+    each_history([&](auto kind, const StencilPart<T>& part) {
+      add_history_products<decltype(kind)>(environment, part);
+    });
+    const auto none = one_by_one([](const auto&, int) {});
+    vertex_field<1, 3>(environment, Elements{none, StencilStored{}});
+  }
+
+  template <class Kind>
+  void add_history_products(std::int64_t environment, const StencilPart<T>& part) {
+    using D = Dual<T>;
+    constexpr ArraysOf<Kind> arrays;
+    constexpr int columns = 3 * Kind::dims;
+    const bool padding = plan_.stencil_measure[part.stencil()] == T(0);
+    const std::int64_t place = place_of<Kind>(environment, part);
+    const T* gradient = call_.history_gradients[history_effect<Kind>] + place * Kind::history;
+    Vec3<T> f[Kind::dims];
+    T row[Kind::rows] = {};
+    read_stencil<Kind>(environment, part, f, row);
+    // of the columns of F, then of the row
+    const auto slope_by = [&](int which) {
+      const auto number = [&](T value, int own) { return D(value, T(own == which ? 1 : 0)); };
+      Vec3<D> at[Kind::dims];
+      D rows[Kind::rows], next[Kind::history];
+      for (int j = 0; j < Kind::dims; ++j)
+        at[j] = {number(f[j].x, 3 * j), number(f[j].y, 3 * j + 1), number(f[j].z, 3 * j + 2)};
+      for (int i = 0; i < Kind::rows; ++i) rows[i] = number(row[i], columns + i);
+      Kind::finish(at, rows, D(T(1) / call_.per_time), next);
+      T sum(0);
+      for (int i = 0; i < Kind::history; ++i) sum = multiply_add(gradient[i], next[i].slope, sum);
+      return sum;
+    };
+    for (int i = 0; i < columns; ++i) w_.numbers[part.number(i)] = padding ? T(0) : slope_by(i);
+    for (int a = 0; !padding && a < arrays.count; ++a) {
+      if (!call_.products[arrays.effect[a]]) continue;
+      T* out = call_.products[arrays.effect[a]] + place * arrays.width(a);
+      for (int i = 0; i < arrays.width(a); ++i) out[i] = slope_by(columns + arrays.first[a] + i);
     }
   }
 

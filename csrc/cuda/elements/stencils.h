@@ -12,7 +12,7 @@ constexpr int stencil_lanes = 32;  // stencils per block of the plan
 // Large kinds would take registers from all others: only the kernels for Poisson's ratio have them.
 constexpr bool has_large_kinds = has_poisson_ratio;
 template <class Kind>
-constexpr bool is_compiled = has_large_kinds || !is_large<Kind>;
+constexpr bool is_compiled = runs_on_gpu<Kind> && (has_large_kinds || !is_large<Kind>);
 
 // The stencils of a plan, and their numbers of a step.
 template <class T>

@@ -10,7 +10,8 @@ namespace pd {
 // Stencils of one kind, see elements/stencil.h; the arrays are the caller's.
 struct StencilGroup {
   int kind = 0, corners = 0, dims = 0, constants = 0;
-  int numbers = 0;  // of a step, for each stencil
+  int numbers = 0;          // of a step, for each stencil
+  bool keeps_axes = false;  // stores g_a as they are
   std::int64_t count = 0;
   const std::int64_t* corner = nullptr;  // [count, corners]
   const double* gradient = nullptr;      // [count, corners, dims] g_a

@@ -35,14 +35,17 @@ Vector axis_along(Vector a, const std::array<Vector, 3>& axes, int known_from, i
 }  // namespace
 
 int stored_gradient_numbers(const StencilGroup& group) {
+  if (group.keeps_axes) return group.dims * (group.corners - 1);
   return group.dims * (group.corners - group.dims) + group.dims * (group.dims - 1) / 2;
 }
 
 std::vector<double> stored_gradients(const StencilGroup& group, std::int64_t s) {
   const int n = group.corners, d = group.dims;
-  if (d == 1) {
+  if (d == 1 || group.keeps_axes) {
     std::vector<double> numbers;
-    for (int a = 1; a < n; ++a) numbers.push_back(gradient_of(group, s, a).x);
+    for (int j = 0; j < d; ++j) {
+      for (int a = 1; a < n; ++a) numbers.push_back(group.gradient[(s * n + a) * d + j]);
+    }
     return numbers;
   }
   // Axis d - 1 along the last vector, axis d - 2 in the plane of the last two, and so on: Gram and Schmidt backwards.

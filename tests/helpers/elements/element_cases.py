@@ -141,6 +141,12 @@ def _damped() -> ElementCase:
     return ElementCase("damped", "damper", gradients, positions, material, 0.25 * 0.05**2, stress, (), start, 0.1)
 
 
+# before any flow
+_VIRGIN: dict[str, float | tuple[float, ...]] = {
+    "plastic_youngs": 1.0, "plastic_poisson": 0.4, "yield_strain": 0.05, "hardening": 0.0, "creep_time": 0.0,
+    "max_flow": np.inf, "flow": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0),
+}  # fmt: skip
+
 ELEMENT_CASES = (
     _uniaxial(1.3, 0.3),
     _uniaxial(0.8, 0.45),
@@ -154,7 +160,11 @@ ELEMENT_CASES = (
     ])),
     _at("inverted", "tet", _INVERTED, _SOFT, 1.6894638741880, {(2, 2): -1.6592959787, (1, 2): -1.6931728596}),
     _at("capped", "tet", _CAPPED, _SOFT, 0.8810446428571, _full((_CAPPED / 1.4).tolist())),
-    _at("plastic", "plastic", _F, {"plastic_youngs": 1.0, "plastic_poisson": 0.4}, 0.1533328234616, {}),
+    _at("plastic", "plastic", _F, _VIRGIN, 0.1533328234616, _full([
+        [0.59259215583, 0.12839335275, -0.06258442296],
+        [0.04784595421, 0.45431170097, 0.17084591456],
+        [-0.01184241555, -0.10013721359, 0.73984320579],
+    ])),
     _at("solid limit", "solid_limit", _F, {"solid_limit": (0.95, 1.05, 1.0)}, 0.0534945564887,
         {(0, 0): 0.0750619053935, (2, 2): 0.2787569508876}),
     _at("volume", "volume", _F, {"volume_stiffness": 1.0}, 0.0144971184378, {(0, 0): 0.0942891129186}),
@@ -241,6 +251,17 @@ def random_gradients(rng: np.random.Generator, count: int, corners: int, width: 
     return np.concatenate([-inner.sum(axis=1, keepdims=True), inner], axis=1)
 
 
+def random_flow(rng: np.random.Generator, count: int) -> dict[str, Array]:
+    """Rows of plastic elements: random numbers of the law, and Fp of determinant 1 with stretches from .5 to 2."""
+    logs = rng.uniform(-0.5, 0.5, (count, 3))
+    stretches = np.exp(logs - logs.mean(axis=1, keepdims=True))
+    plastic = random_rotations(rng, count) @ (stretches[:, :, None] * random_rotations(rng, count))
+    rows = {"yield_strain": (0.01, 0.1), "hardening": (0.0, 1.0), "creep_time": (0.0, 0.1), "max_flow": (0.1, 1.0)}
+    return {name: rng.uniform(*ends, count) for name, ends in rows.items()} | {
+        "flow": np.concatenate([plastic.reshape(count, 9), rng.uniform(0.0, 0.1, (count, 1))], axis=1)
+    }
+
+
 def random_material(rng: np.random.Generator, kind: str, count: int, *, decades: float = 4.0) -> dict[str, Array]:
     """Rows of the kind, stiffnesses spread over some decades, Poisson's ratios up to 0.49."""
     stiff, ratio, length = (
@@ -251,7 +272,7 @@ def random_material(rng: np.random.Generator, kind: str, count: int, *, decades:
     limits = np.stack([rng.uniform(0.2, 1.0, count), rng.uniform(1.0, 2.0, count), stiff], axis=1)
     return {
         "tet": {"stiffness": stiff, "poisson": ratio},
-        "plastic": {"plastic_youngs": stiff, "plastic_poisson": ratio},
+        "plastic": {"plastic_youngs": stiff, "plastic_poisson": ratio, **random_flow(rng, count)},
         "triangle": {"membrane_youngs": stiff, "membrane_poisson": 2.0 * ratio, "thickness": 0.1 + length},
         "hinge": {"bending": stiff, "rest_curvature": length * (np.arange(count) % 2)},
         "spring": {"spring_stiffness": stiff, "rest_length": length},
