@@ -49,16 +49,19 @@ PD_HD R trace_strain(const Mat3<R>& f, const Mat3<R>& strain) {
 template <class R, int Members, class Lanes = WholeGroup>
 PD_HD R group_average(const R (&value)[Members], const R (&pressure)[Members],
                       const Lanes& lanes = {}) {
-  if constexpr (Members == 1 && std::is_same_v<Lanes, WholeGroup>) return value[0];
-  R sum = pressure[0], product = pressure[0] * value[0];
-  for (int m = 1; m < Members; ++m) {
-    sum = sum + pressure[m];
-    product = multiply_add(pressure[m], value[m], product);
+  if constexpr (Members == 1 && std::is_same_v<Lanes, WholeGroup>) {
+    return value[0];
+  } else {
+    R sum = pressure[0], product = pressure[0] * value[0];
+    for (int m = 1; m < Members; ++m) {
+      sum = sum + pressure[m];
+      product = multiply_add(pressure[m], value[m], product);
+    }
+    sum = lanes.sum(sum);
+    product = lanes.sum(product);
+    using T = scalar_of<R>;
+    return product * reciprocal(select(lesser(sum, -sum) < R(T(0)), sum, R(T(1))));
   }
-  sum = lanes.sum(sum);
-  product = lanes.sum(product);
-  using T = scalar_of<R>;
-  return product * reciprocal(select(lesser(sum, -sum) < R(T(0)), sum, R(T(1))));
 }
 
 // phi of a group and its derivatives at the group's t
