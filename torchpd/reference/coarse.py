@@ -1,0 +1,287 @@
+"""Coarse correction of an iterate: the rigid motions of bodies with the least energy, contacts as envelopes.
+
+Each body moves by a twist q about its centre, as far as its hard pins leave it free; an island is a body, or bodies
+that pairs join. Elastic energy does not change, so q minimises
+
+    Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
+
+with the friction radius r = friction l of the outer step before. An outer step solves the quadratic model of Phi by
+Newton passes, then settles friction by sweeps of Gauss-Seidel over the same envelopes with the coupled cone, and halves
+the motion until Phi has not risen. The pushes p of the touching vertices follow. At a converged step q = 0 and p = 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from .envelopes import Envelopes, PairContacts, contacts_at
+
+if TYPE_CHECKING:
+    from .problem import StepProblem
+
+__all__ = ["RigidMotions", "correct", "islands"]
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+OUTER = 3  # outer steps: turns, gaps and friction radii are taken anew
+PASSES = 12  # Newton passes of an outer step
+SWEEPS = 10  # sweeps of Gauss-Seidel, where there is friction
+HALVINGS = 8
+HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
+EXACT = 1e-12  # rounding: relative change of an energy, and motion over the size of a body, that count as none
+
+
+@dataclass(frozen=True)
+class RigidMotions:
+    """Twists (v, w) of the bodies of one island at an iterate: y = c + exp([w]x) (y - c) + v, c the centre of a body."""
+
+    problem: StepProblem
+    displacement: Array  # [V, 3] m
+    bodies: tuple[Index, ...]  # vertices of every body
+
+    @cached_property
+    def bases(self) -> list[tuple[Array, Array]]:
+        """Centre [3] and twists [6, d] that its pins leave free, of every body."""
+        return [self._basis(body) for body in self.bodies]
+
+    def _basis(self, body: Index) -> tuple[Array, Array]:
+        y, free = self.problem.positions[body] + self.displacement[body], self.problem.free[body]
+        if free.all():
+            weight = self.problem.weight[body, None]
+            return (weight * y).sum(axis=0) / weight.sum(), np.eye(6)
+        # about the mean of the pins: what they leave free are turns alone
+        centre = y[~free].mean(axis=0)
+        lengths = np.repeat([1.0, float(np.linalg.norm(y - centre, axis=1).max())], 3)
+        pinned = _twists(y[~free] - centre).reshape(-1, 6) / lengths
+        values, vectors = np.linalg.eigh(pinned.T @ pinned / int((~free).sum()))
+        return centre, vectors[:, values < HELD] / lengths[:, None]
+
+    @cached_property
+    def size(self) -> float:
+        """Extent of the largest body [m]."""
+        return max(float(np.ptp(self.problem.positions[body], axis=0).max()) for body in self.bodies)
+
+    @cached_property
+    def modes(self) -> Array:
+        """Z [V, 3, N]: displacements by the twists to first order; zero at hard pins."""
+        modes = np.zeros((*self.displacement.shape, sum(basis.shape[1] for _, basis in self.bases)))
+        at = 0
+        for body, (centre, basis) in zip(self.bodies, self.bases, strict=True):
+            own = body[self.problem.free[body]]
+            arms = self.problem.positions[own] + self.displacement[own] - centre
+            modes[own, :, at : at + basis.shape[1]] = _twists(arms) @ basis
+            at += basis.shape[1]
+        return modes
+
+    @cached_property
+    def gradient(self) -> Array:
+        """Derivative [N] of sum a / 2 |u - s|^2 by the twists."""
+        pull = self.problem.weight[:, None] * (self.displacement - self.problem.target)
+        return np.einsum("vin,vi->n", self.modes, pull)
+
+    @cached_property
+    def hessian(self) -> Array:
+        """Second derivative [N, N] by the twists: exact where it is positive definite, else without curvature."""
+        flat = self.modes.reshape(-1, self.modes.shape[2])
+        hessian, at = flat.T @ (np.repeat(self.problem.weight, 3)[:, None] * flat), 0
+        for body, (centre, basis) in zip(self.bodies, self.bases, strict=True):
+            own, of = body[self.problem.free[body]], slice(at, at + basis.shape[1])
+            arms = self.problem.positions[own] + self.displacement[own] - centre
+            left = self.problem.weight[own, None] * (self.problem.target[own] - self.displacement[own])
+            exact = hessian[of, of] + basis.T @ _curvature(left, arms) @ basis
+            if basis.shape[1] and np.linalg.eigvalsh(exact)[0] > 0.0:
+                hessian[of, of] = exact
+            at += basis.shape[1]
+        return hessian
+
+    def moved(self, twists: Array) -> Array:
+        """Displacement [V, 3] m after finite motions along the twists [N]; hard pins stay."""
+        displacement, at = self.displacement.copy(), 0
+        for body, (centre, basis) in zip(self.bodies, self.bases, strict=True):
+            own = body[self.problem.free[body]]
+            arms = self.problem.positions[own] + displacement[own] - centre
+            displacement[own] += _finite(basis @ twists[at : at + basis.shape[1]], arms)
+            at += basis.shape[1]
+        return displacement
+
+    def energy(self, displacement: Array) -> float:
+        """sum a / 2 |u - s|^2 [J] of the free vertices of the island."""
+        own = np.concatenate(self.bodies)
+        own = own[self.problem.free[own]]
+        return 0.5 * float(self.problem.weight[own] @ ((displacement - self.problem.target)[own] ** 2).sum(axis=1))
+
+
+def correct(problem: StepProblem, displacement: Array, forces: Array, pairs: PairContacts | None = None) -> Array:
+    """Displacement [V, 3] m after the coarse correction of every island.
+
+    Args:
+        problem: the step.
+        displacement: [V, 3] m; hard pins at their targets.
+        forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
+        pairs: contacts between bodies, with their forces at the iterate.
+    """
+    corrected = displacement.copy()
+    for bodies, own in islands(problem, pairs):
+        corrected = _correct_island(RigidMotions(problem, corrected, bodies), forces, own)
+    return corrected
+
+
+def islands(problem: StepProblem, pairs: PairContacts | None) -> Iterator[tuple[tuple[Index, ...], PairContacts | None]]:
+    """The bodies of every island, as their vertices, and its pairs."""
+    component = problem.values.component
+    count = int(component.max()) + 1
+    number = np.arange(count)
+    if pairs is not None:
+        ends = component[pairs.vertices[:, [0, 3]]]
+        links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+        number = connected_components(links, directed=False)[1]
+    for island in range(int(number.max()) + 1):
+        members = np.flatnonzero(number == island)
+        own = None
+        if pairs is not None:
+            of = number[component[pairs.vertices[:, 0]]] == island
+            own = PairContacts(*(getattr(pairs, name)[of] for name in pairs.__dataclass_fields__)) if of.any() else None
+        yield tuple(np.flatnonzero(component == body) for body in members), own
+
+
+def _correct_island(rigid: RigidMotions, forces: Array, pairs: PairContacts | None) -> Array:
+    problem, vertices = rigid.problem, np.concatenate(rigid.bodies)
+    contacts = contacts_at(problem, rigid.displacement, forces, vertices, pairs)
+    radius = contacts.friction * contacts.normal_anchors
+    for _ in range(OUTER):
+        if not rigid.modes.shape[2]:
+            break
+        jacobian = np.einsum("mw,mwin->min", contacts.weights, rigid.modes[contacts.vertices])
+        twists = _newton_passes(rigid, contacts, jacobian, radius)
+        if contacts.friction.any():
+            twists, radius = _sweeps(rigid, contacts, jacobian, twists, radius)
+        energy = rigid.energy(rigid.displacement) + contacts.energy(radius)
+        for _ in range(HALVINGS):
+            moved = rigid.moved(twists)
+            after = contacts_at(problem, moved, forces, vertices, pairs)
+            way = (contacts.weights[:, :, None] * (moved - rigid.displacement)[contacts.vertices]).sum(axis=1)
+            trial = replace(contacts.shifted(way), gaps=after.gaps)
+            if rigid.energy(moved) + trial.energy(radius) <= energy * (1.0 + EXACT):
+                break
+            twists = 0.5 * twists
+        else:
+            break
+        still, rigid, contacts = rigid, replace(rigid, displacement=moved), after
+        radius = contacts.friction * trial.normal_forces()
+        if np.abs(moved - still.displacement).max() < EXACT * rigid.size:
+            break
+    return _pushed(rigid, contacts, radius)
+
+
+def _newton_passes(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, radius: Array) -> Array:
+    """Twists [N] of least quadratic model of Phi, for a fixed friction radius [m] N."""
+    gradient, hessian = rigid.gradient, rigid.hessian
+    twists, trial = np.zeros(len(gradient)), contacts
+    energy = contacts.energy(radius)
+    for _ in range(PASSES):
+        forces, second = trial.forces(radius), trial.second_derivatives(radius)
+        on = second.any(axis=(1, 2))
+        matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
+        step = np.linalg.solve(matrix, np.einsum("min,mi->n", jacobian, forces) - gradient - hessian @ twists)
+        for _ in range(HALVINGS):
+            moved = contacts.shifted(jacobian @ (twists + step))
+            reached = moved.energy(radius) + float((gradient + 0.5 * hessian @ (twists + step)) @ (twists + step))
+            if reached <= energy + EXACT * abs(energy):
+                break
+            step = 0.5 * step
+        else:
+            break
+        twists, trial, energy = twists + step, moved, reached
+        if np.abs(rigid.modes @ step).max() < EXACT * rigid.size:
+            break
+    return twists
+
+
+def _sweeps(
+    rigid: RigidMotions, contacts: Envelopes, jacobian: Array, twists: Array, radius: Array
+) -> tuple[Array, Array]:
+    """Twists [N] and friction radii [m] N after projected Gauss-Seidel on the quadratic model, from Newton's forces.
+
+    One contact after another takes the normal force and then the friction, within the cone of that force, that solve
+    its own rows: l = max(0, l - (gap + (l - l0) / k) / (W + 1 / k)) with W = J H^-1 J^T.
+    """
+    newton = contacts.shifted(jacobian @ twists)
+    l, t = newton.normal_forces(), newton.tangent_forces(radius)[0]
+    inverse = np.linalg.inv(rigid.hessian)
+    twists = inverse @ (np.einsum("min,mi->n", jacobian, l[:, None] * contacts.normals + t) - rigid.gradient)
+    reply = np.einsum("nk,mik->min", inverse, jacobian)
+    give = np.einsum("min,mjn->mij", jacobian, reply)
+    n, soft = contacts.normals, 1.0 / contacts.stiffness
+    along = np.einsum("mi,mij,mj->m", n, give, n)
+    across = np.trace(give, axis1=1, axis2=2) - along
+    for _ in range(SWEEPS):
+        change = 0.0
+        near = contacts.shifted(jacobian @ twists).normal_forces() > 0.0
+        for i in np.flatnonzero(near | (l > 0.0) | t.any(axis=1)):
+            gap = contacts.gaps[i] + float(n[i] @ jacobian[i] @ twists)
+            push = max(0.0, l[i] - (gap + soft[i] * (l[i] - contacts.normal_anchors[i])) / (along[i] + soft[i]))
+            change, twists = max(change, abs(push - l[i]) * along[i]), twists + (push - l[i]) * (n[i] @ reply[i])
+            l[i] = push
+            way = jacobian[i] @ twists
+            slip = contacts.slips[i] + way - float(way @ n[i]) * n[i]
+            rub = t[i] - (slip + soft[i] * (t[i] - contacts.tangent_anchors[i])) / (across[i] + soft[i])
+            rub *= min(1.0, contacts.friction[i] * push / max(float(np.linalg.norm(rub)), 1e-300))
+            change, twists = max(change, float(np.abs(rub - t[i]).max()) * across[i]), twists + (rub - t[i]) @ reply[i]
+            t[i] = rub
+        if change < EXACT * rigid.size:
+            break
+    return twists, contacts.friction * l
+
+
+def _pushed(rigid: RigidMotions, contacts: Envelopes, radius: Array) -> Array:
+    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island."""
+    problem = rigid.problem
+    before = contacts.normal_anchors[:, None] * contacts.normals + contacts.tangent_anchors
+    each = contacts.weights[:, :, None] * (contacts.forces(radius) - before)[:, None, :]
+    forces = np.zeros_like(rigid.displacement)
+    np.add.at(forces, contacts.vertices.reshape(-1), each.reshape(-1, 3))
+    pushed = rigid.displacement + np.where(problem.free[:, None], forces / problem.weighted_diagonal[:, None], 0.0)
+    moved, own = rigid.displacement.copy(), np.concatenate(rigid.bodies)
+    moved[own] = problem.project(pushed)[own]
+    return moved
+
+
+def _twists(arms: Array) -> Array:
+    """[1, -[r]x] [n, 3, 6]: the displacement of points at arms r [n, 3] by a twist (v, w) is v + w x r."""
+    modes = np.zeros((len(arms), 3, 6))
+    modes[:, :, :3] = np.eye(3)
+    modes[:, :, 3:] = -_cross(arms)
+    return modes
+
+
+def _cross(vectors: Array) -> Array:
+    """[v]x [..., 3, 3] with [v]x b = v x b."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    nothing = np.zeros_like(x)
+    rows = [[nothing, -z, y], [z, nothing, -x], [-y, x, nothing]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _curvature(left: Array, arms: Array) -> Array:
+    """Second derivative [6, 6] of -sum left . (finite motion - its first order) by the twist; left = a (s - u)."""
+    moment = left.T @ arms
+    curvature = np.zeros((6, 6))
+    curvature[3:, 3:] = np.trace(moment) * np.eye(3) - 0.5 * (moment + moment.T)
+    return curvature
+
+
+def _finite(twist: Array, arms: Array) -> Array:
+    """Finite displacement [n, 3] of points at arms [n, 3] by a twist (v, w): (exp [w]x - 1) r + v."""
+    w, angle = _cross(twist[3:]), float(np.linalg.norm(twist[3:]))
+    half = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2  # (1 - cos angle) / angle^2
+    turn = np.sinc(angle / np.pi) * w + half * w @ w
+    return np.asarray(arms @ turn.T + twist[:3])
