@@ -42,11 +42,24 @@ EXACT = 1e-12  # rounding: relative change of an energy, and motion over the siz
 
 @dataclass(frozen=True)
 class RigidMotions:
-    """Twists (v, w) of the bodies of one island at an iterate: y = c + exp([w]x) (y - c) + v, c the centre of a body."""
+    """Twists (v, w) of the bodies of one island at an iterate: y = c + exp([w]x) (y - c) + v with the centre c.
+
+    All sums run over the vertices of the island alone, so that their bits do not depend on other bodies.
+    """
 
     problem: StepProblem
-    displacement: Array  # [V, 3] m
+    displacement: Array  # [V, 3] m, of the whole scene
     bodies: tuple[Index, ...]  # vertices of every body
+
+    @cached_property
+    def free(self) -> list[Index]:
+        """Vertices without hard pins of every body."""
+        return [body[self.problem.free[body]] for body in self.bodies]
+
+    @cached_property
+    def vertices(self) -> Index:
+        """[n] vertices without hard pins of the island."""
+        return np.concatenate(self.free)
 
     @cached_property
     def bases(self) -> list[tuple[Array, Array]]:
@@ -66,58 +79,68 @@ class RigidMotions:
         return centre, vectors[:, values < HELD] / lengths[:, None]
 
     @cached_property
+    def parts(self) -> list[tuple[Index, Array, Array, slice, slice]]:
+        """Of every body: free vertices, their arms, the basis, and the places of both in the arrays of the island."""
+        out, row, column = [], 0, 0
+        for own, (centre, basis) in zip(self.free, self.bases, strict=True):
+            arms = self.problem.positions[own] + self.displacement[own] - centre
+            rows, columns = slice(row, row + len(own)), slice(column, column + basis.shape[1])
+            out.append((own, arms, basis, rows, columns))
+            row, column = rows.stop, columns.stop
+        return out
+
+    @cached_property
     def size(self) -> float:
         """Extent of the largest body [m]."""
         return max(float(np.ptp(self.problem.positions[body], axis=0).max()) for body in self.bodies)
 
     @cached_property
     def modes(self) -> Array:
-        """Z [V, 3, N]: displacements by the twists to first order; zero at hard pins."""
-        modes = np.zeros((*self.displacement.shape, sum(basis.shape[1] for _, basis in self.bases)))
-        at = 0
-        for body, (centre, basis) in zip(self.bodies, self.bases, strict=True):
-            own = body[self.problem.free[body]]
-            arms = self.problem.positions[own] + self.displacement[own] - centre
-            modes[own, :, at : at + basis.shape[1]] = _twists(arms) @ basis
-            at += basis.shape[1]
+        """Z [n, 3, N]: displacements by the twists to first order."""
+        modes = np.zeros((len(self.vertices), 3, sum(basis.shape[1] for _, basis in self.bases)))
+        for _, arms, basis, rows, columns in self.parts:
+            modes[rows, :, columns] = _twists(arms) @ basis
         return modes
+
+    @cached_property
+    def pull(self) -> Array:
+        """a (s - u) [n, 3] N."""
+        own = self.vertices
+        return np.asarray(self.problem.weight[own, None] * (self.problem.target[own] - self.displacement[own]))
 
     @cached_property
     def gradient(self) -> Array:
         """Derivative [N] of sum a / 2 |u - s|^2 by the twists."""
-        pull = self.problem.weight[:, None] * (self.displacement - self.problem.target)
-        return np.einsum("vin,vi->n", self.modes, pull)
+        return np.asarray(-np.einsum("vin,vi->n", self.modes, self.pull))
 
     @cached_property
     def hessian(self) -> Array:
         """Second derivative [N, N] by the twists: exact where it is positive definite, else without curvature."""
-        flat = self.modes.reshape(-1, self.modes.shape[2])
-        hessian, at = flat.T @ (np.repeat(self.problem.weight, 3)[:, None] * flat), 0
-        for body, (centre, basis) in zip(self.bodies, self.bases, strict=True):
-            own, of = body[self.problem.free[body]], slice(at, at + basis.shape[1])
-            arms = self.problem.positions[own] + self.displacement[own] - centre
-            left = self.problem.weight[own, None] * (self.problem.target[own] - self.displacement[own])
-            exact = hessian[of, of] + basis.T @ _curvature(left, arms) @ basis
+        hessian = np.einsum("vin,v,vik->nk", self.modes, self.problem.weight[self.vertices], self.modes, optimize=True)
+        for _, arms, basis, rows, columns in self.parts:
+            exact = hessian[columns, columns] + basis.T @ _curvature(self.pull[rows], arms) @ basis
             if basis.shape[1] and np.linalg.eigvalsh(exact)[0] > 0.0:
-                hessian[of, of] = exact
-            at += basis.shape[1]
-        return hessian
+                hessian[columns, columns] = exact
+        return np.asarray(hessian)
+
+    def jacobian(self, contacts: Envelopes) -> Array:
+        """Derivative [m, 3, N] of the relative displacements of contacts by the twists."""
+        place = np.full(len(self.displacement), -1)  # the row of zeros, for hard pins
+        place[self.vertices] = np.arange(len(self.vertices))
+        modes = np.concatenate([self.modes, np.zeros((1, *self.modes.shape[1:]))])
+        return np.asarray(np.einsum("mw,mwin->min", contacts.weights, modes[place[contacts.vertices]]))
 
     def moved(self, twists: Array) -> Array:
         """Displacement [V, 3] m after finite motions along the twists [N]; hard pins stay."""
-        displacement, at = self.displacement.copy(), 0
-        for body, (centre, basis) in zip(self.bodies, self.bases, strict=True):
-            own = body[self.problem.free[body]]
-            arms = self.problem.positions[own] + displacement[own] - centre
-            displacement[own] += _finite(basis @ twists[at : at + basis.shape[1]], arms)
-            at += basis.shape[1]
+        displacement = self.displacement.copy()
+        for own, arms, basis, _, columns in self.parts:
+            displacement[own] += _finite(basis @ twists[columns], arms)
         return displacement
 
     def energy(self, displacement: Array) -> float:
         """sum a / 2 |u - s|^2 [J] of the free vertices of the island."""
-        own = np.concatenate(self.bodies)
-        own = own[self.problem.free[own]]
-        return 0.5 * float(self.problem.weight[own] @ ((displacement - self.problem.target)[own] ** 2).sum(axis=1))
+        left = (displacement - self.problem.target)[self.vertices]
+        return 0.5 * float(self.problem.weight[self.vertices] @ (left**2).sum(axis=1))
 
 
 def correct(problem: StepProblem, displacement: Array, forces: Array, pairs: PairContacts | None = None) -> Array:
@@ -135,7 +158,9 @@ def correct(problem: StepProblem, displacement: Array, forces: Array, pairs: Pai
     return corrected
 
 
-def islands(problem: StepProblem, pairs: PairContacts | None) -> Iterator[tuple[tuple[Index, ...], PairContacts | None]]:
+def islands(
+    problem: StepProblem, pairs: PairContacts | None = None
+) -> Iterator[tuple[tuple[Index, ...], PairContacts | None]]:
     """The bodies of every island, as their vertices, and its pairs."""
     component = problem.values.component
     count = int(component.max()) + 1
@@ -160,7 +185,7 @@ def _correct_island(rigid: RigidMotions, forces: Array, pairs: PairContacts | No
     for _ in range(OUTER):
         if not rigid.modes.shape[2]:
             break
-        jacobian = np.einsum("mw,mwin->min", contacts.weights, rigid.modes[contacts.vertices])
+        jacobian = rigid.jacobian(contacts)
         twists = _newton_passes(rigid, contacts, jacobian, radius)
         if contacts.friction.any():
             twists, radius = _sweeps(rigid, contacts, jacobian, twists, radius)
@@ -215,9 +240,9 @@ def _sweeps(
     its own rows: l = max(0, l - (gap + (l - l0) / k) / (W + 1 / k)) with W = J H^-1 J^T.
     """
     newton = contacts.shifted(jacobian @ twists)
-    l, t = newton.normal_forces(), newton.tangent_forces(radius)[0]
+    pushes, t = newton.normal_forces(), newton.tangent_forces(radius)[0]
     inverse = np.linalg.inv(rigid.hessian)
-    twists = inverse @ (np.einsum("min,mi->n", jacobian, l[:, None] * contacts.normals + t) - rigid.gradient)
+    twists = inverse @ (np.einsum("min,mi->n", jacobian, pushes[:, None] * contacts.normals + t) - rigid.gradient)
     reply = np.einsum("nk,mik->min", inverse, jacobian)
     give = np.einsum("min,mjn->mij", jacobian, reply)
     n, soft = contacts.normals, 1.0 / contacts.stiffness
@@ -226,20 +251,21 @@ def _sweeps(
     for _ in range(SWEEPS):
         change = 0.0
         near = contacts.shifted(jacobian @ twists).normal_forces() > 0.0
-        for i in np.flatnonzero(near | (l > 0.0) | t.any(axis=1)):
-            gap = contacts.gaps[i] + float(n[i] @ jacobian[i] @ twists)
-            push = max(0.0, l[i] - (gap + soft[i] * (l[i] - contacts.normal_anchors[i])) / (along[i] + soft[i]))
-            change, twists = max(change, abs(push - l[i]) * along[i]), twists + (push - l[i]) * (n[i] @ reply[i])
-            l[i] = push
+        for i in np.flatnonzero(near | (pushes > 0.0) | t.any(axis=1)):
+            lack = contacts.gaps[i] + float(n[i] @ jacobian[i] @ twists)
+            lack += soft[i] * (pushes[i] - contacts.normal_anchors[i])
+            push = max(0.0, pushes[i] - lack / (along[i] + soft[i]))
+            twists = twists + (push - pushes[i]) * (n[i] @ reply[i])
             way = jacobian[i] @ twists
             slip = contacts.slips[i] + way - float(way @ n[i]) * n[i]
             rub = t[i] - (slip + soft[i] * (t[i] - contacts.tangent_anchors[i])) / (across[i] + soft[i])
             rub *= min(1.0, contacts.friction[i] * push / max(float(np.linalg.norm(rub)), 1e-300))
-            change, twists = max(change, float(np.abs(rub - t[i]).max()) * across[i]), twists + (rub - t[i]) @ reply[i]
-            t[i] = rub
+            twists = twists + (rub - t[i]) @ reply[i]
+            change = max(change, abs(push - pushes[i]) * along[i], float(np.linalg.norm(rub - t[i])) * across[i])
+            pushes[i], t[i] = push, rub
         if change < EXACT * rigid.size:
             break
-    return twists, contacts.friction * l
+    return twists, contacts.friction * pushes
 
 
 def _pushed(rigid: RigidMotions, contacts: Envelopes, radius: Array) -> Array:

@@ -48,10 +48,10 @@ def first_iterate(problem: StepProblem) -> Array:
 def _rigid_fit(problem: StepProblem, displacement: Array, goal: Array) -> Array:
     """The rigid motions [V, 3] m of the bodies that bring an iterate nearest to a goal; contacts are ignored."""
     toward = replace(problem, target=goal)
-    for bodies, _ in islands(problem, None):
+    for bodies, _ in islands(problem):
         for _ in range(FITS):
             rigid = RigidMotions(toward, displacement, bodies)
-            displacement = rigid.moved(-np.linalg.solve(rigid.hessian, rigid.gradient))
+            displacement = rigid.moved(np.asarray(-np.linalg.solve(rigid.hessian, rigid.gradient), np.float64))
     return displacement
 
 
@@ -60,11 +60,11 @@ def energies(problem: StepProblem, displacement: Array) -> Array:
     component, count = problem.values.component, int(problem.values.component.max()) + 1
     pull = np.where(problem.free[:, None], displacement - problem.target, 0.0)
     inertia = 0.5 * problem.weight * (pull**2).sum(axis=1)
-    energy = np.bincount(component, inertia, count)
+    energy = np.asarray(np.bincount(component, inertia, count), np.float64)
     for group in problem.groups:
         each = group.law.evaluate(group.deformation(displacement))[0]
         energy = energy + np.bincount(component[group.stencils.corners[:, 0]], each, count)
-    return energy
+    return np.asarray(energy, np.float64)
 
 
 def coarse_chebyshev(

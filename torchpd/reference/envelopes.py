@@ -58,7 +58,7 @@ class Envelopes:
 
     def tangential(self, vectors: Array) -> Array:
         """The part of vectors [m, 3] along the surfaces."""
-        return vectors - (vectors * self.normals).sum(axis=1, keepdims=True) * self.normals
+        return np.asarray(vectors - (vectors * self.normals).sum(axis=1, keepdims=True) * self.normals)
 
     def shifted(self, motion: Array) -> Envelopes:
         """The same contacts after relative displacements [m, 3] m, to first order."""
@@ -67,7 +67,7 @@ class Envelopes:
 
     def normal_forces(self) -> Array:
         """l [m] N."""
-        return np.maximum(0.0, self.normal_anchors - self.stiffness * self.gaps)
+        return np.asarray(np.maximum(0.0, self.normal_anchors - self.stiffness * self.gaps))
 
     def tangent_forces(self, radius: Array) -> tuple[Array, Array]:
         """t [m, 3] N, and the fraction r / |b| <= 1 to which b = t0 - k slip is cut; both zero where r = 0."""

@@ -171,9 +171,7 @@ class StepProblem:
         pass their current iterate as `around`. With the normal of the unprojected step, the point where friction
         comes to rest would depend on the step length.
         """
-        moved = displacement
-        for moved in self.projections(displacement, displacement if around is None else around):
-            pass
+        *_, moved = displacement, *self.projections(displacement, displacement if around is None else around)
         return np.where(self.free[:, None], moved, displacement)
 
     def projections(self, displacement: Array, around: Array) -> Iterator[Array]:
