@@ -20,6 +20,7 @@ Solve = Callable[[StepProblem], Array]
 H = 1.0 / 60.0
 CUBE = (0.1, 0.1, 0.1)
 SOLVED = 1e-9  # residual of a converged step
+FALL = 0.5 * 9.8 * H  # m/s: what gravity gives in half a step, the least speed that errors are compared with
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def error(course: Course, run: list[tuple[Array, Array]], exact: list[tuple[Arra
     masses, size = course.scene.values().masses, float(np.ptp(course.positions, axis=0).max())
     motions = [[middle_and_spin(masses, x, v) for x, v in states] for states in (run, exact)]
     fastest = max(max(np.linalg.norm(v), 0.5 * size * np.linalg.norm(w)) for v, w in motions[1])
-    worst = 0.0
+    worst, fastest = 0.0, max(fastest, FALL)
     for (v, w), (v0, w0) in zip(*motions, strict=True):
         worst = max(worst, float(np.linalg.norm(v - v0)), 0.5 * size * float(np.linalg.norm(w - w0)))
     return worst / float(fastest)

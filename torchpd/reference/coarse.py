@@ -5,9 +5,9 @@ that pairs join. Elastic energy does not change, so q minimises
 
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
-with the friction radius r = friction l of the outer step before. An outer step solves the quadratic model of Phi by
-Newton passes, then settles friction by sweeps of Gauss-Seidel over the same envelopes with the coupled cone, and halves
-the motion until Phi has not risen. The pushes p of the touching vertices follow. At a converged step q = 0 and p = 0.
+with a fixed friction radius r. An outer step minimises the quadratic model of Phi by Newton passes, and moves r toward
+friction l in between. It halves the motion until Phi has not risen. The pushes p of the touching vertices follow. At a
+converged step q = 0 and p = 0.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Index = NDArray[np.int64]
 
 OUTER = 3  # outer steps: turns, gaps and friction radii are taken anew
 PASSES = 12  # Newton passes of an outer step
-SWEEPS = 10  # sweeps of Gauss-Seidel, where there is friction
+SETTLE = 4  # minimisations of an outer step, between which friction radii go half of the way to friction l
 HALVINGS = 8
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
 EXACT = 1e-12  # rounding: relative change of an energy, and motion over the size of a body, that count as none
@@ -186,9 +186,7 @@ def _correct_island(rigid: RigidMotions, forces: Array, pairs: PairContacts | No
         if not rigid.modes.shape[2]:
             break
         jacobian = rigid.jacobian(contacts)
-        twists = _newton_passes(rigid, contacts, jacobian, radius)
-        if contacts.friction.any():
-            twists, radius = _sweeps(rigid, contacts, jacobian, twists, radius)
+        twists, radius = _settled(rigid, contacts, jacobian, radius)
         energy = rigid.energy(rigid.displacement) + contacts.energy(radius)
         for _ in range(HALVINGS):
             moved = rigid.moved(twists)
@@ -207,11 +205,31 @@ def _correct_island(rigid: RigidMotions, forces: Array, pairs: PairContacts | No
     return _pushed(rigid, contacts, radius)
 
 
-def _newton_passes(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, radius: Array) -> Array:
-    """Twists [N] of least quadratic model of Phi, for a fixed friction radius [m] N."""
+def _settled(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, radius: Array) -> tuple[Array, Array]:
+    """Twists [N] of the quadratic model, and friction radii [m] N near those of the normal forces that they leave.
+
+    Radii that follow the normal forces at once oscillate where a stiff body lands on rough ground; half of the way
+    settles. The twists minimise the model for the radii returned, which the guard needs.
+    """
+    twists = np.zeros(len(rigid.gradient))
+    for _ in range(SETTLE - 1):
+        twists = _newton_passes(rigid, contacts, jacobian, radius, twists)
+        lag = contacts.friction * contacts.shifted(jacobian @ twists).normal_forces() - radius
+        if np.linalg.norm(lag) <= EXACT * np.linalg.norm(radius):
+            return twists, radius
+        radius = radius + 0.5 * lag
+    return _newton_passes(rigid, contacts, jacobian, radius, twists), radius
+
+
+def _newton_passes(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, radius: Array, twists: Array) -> Array:
+    """Twists [N] of least quadratic model of Phi for fixed friction radii [m] N, from given ones."""
     gradient, hessian = rigid.gradient, rigid.hessian
-    twists, trial = np.zeros(len(gradient)), contacts
-    energy = contacts.energy(radius)
+
+    def model(twists: Array, moved: Envelopes) -> float:
+        return moved.energy(radius) + float((gradient + 0.5 * hessian @ twists) @ twists)
+
+    trial = contacts.shifted(jacobian @ twists)
+    energy = model(twists, trial)
     for _ in range(PASSES):
         forces, second = trial.forces(radius), trial.second_derivatives(radius)
         on = second.any(axis=(1, 2))
@@ -219,7 +237,7 @@ def _newton_passes(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, ra
         step = np.linalg.solve(matrix, np.einsum("min,mi->n", jacobian, forces) - gradient - hessian @ twists)
         for _ in range(HALVINGS):
             moved = contacts.shifted(jacobian @ (twists + step))
-            reached = moved.energy(radius) + float((gradient + 0.5 * hessian @ (twists + step)) @ (twists + step))
+            reached = model(twists + step, moved)
             if reached <= energy + EXACT * abs(energy):
                 break
             step = 0.5 * step
@@ -229,43 +247,6 @@ def _newton_passes(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, ra
         if np.abs(rigid.modes @ step).max() < EXACT * rigid.size:
             break
     return twists
-
-
-def _sweeps(
-    rigid: RigidMotions, contacts: Envelopes, jacobian: Array, twists: Array, radius: Array
-) -> tuple[Array, Array]:
-    """Twists [N] and friction radii [m] N after projected Gauss-Seidel on the quadratic model, from Newton's forces.
-
-    One contact after another takes the normal force and then the friction, within the cone of that force, that solve
-    its own rows: l = max(0, l - (gap + (l - l0) / k) / (W + 1 / k)) with W = J H^-1 J^T.
-    """
-    newton = contacts.shifted(jacobian @ twists)
-    pushes, t = newton.normal_forces(), newton.tangent_forces(radius)[0]
-    inverse = np.linalg.inv(rigid.hessian)
-    twists = inverse @ (np.einsum("min,mi->n", jacobian, pushes[:, None] * contacts.normals + t) - rigid.gradient)
-    reply = np.einsum("nk,mik->min", inverse, jacobian)
-    give = np.einsum("min,mjn->mij", jacobian, reply)
-    n, soft = contacts.normals, 1.0 / contacts.stiffness
-    along = np.einsum("mi,mij,mj->m", n, give, n)
-    across = np.trace(give, axis1=1, axis2=2) - along
-    for _ in range(SWEEPS):
-        change = 0.0
-        near = contacts.shifted(jacobian @ twists).normal_forces() > 0.0
-        for i in np.flatnonzero(near | (pushes > 0.0) | t.any(axis=1)):
-            lack = contacts.gaps[i] + float(n[i] @ jacobian[i] @ twists)
-            lack += soft[i] * (pushes[i] - contacts.normal_anchors[i])
-            push = max(0.0, pushes[i] - lack / (along[i] + soft[i]))
-            twists = twists + (push - pushes[i]) * (n[i] @ reply[i])
-            way = jacobian[i] @ twists
-            slip = contacts.slips[i] + way - float(way @ n[i]) * n[i]
-            rub = t[i] - (slip + soft[i] * (t[i] - contacts.tangent_anchors[i])) / (across[i] + soft[i])
-            rub *= min(1.0, contacts.friction[i] * push / max(float(np.linalg.norm(rub)), 1e-300))
-            twists = twists + (rub - t[i]) @ reply[i]
-            change = max(change, abs(push - pushes[i]) * along[i], float(np.linalg.norm(rub - t[i])) * across[i])
-            pushes[i], t[i] = push, rub
-        if change < EXACT * rigid.size:
-            break
-    return twists, contacts.friction * pushes
 
 
 def _pushed(rigid: RigidMotions, contacts: Envelopes, radius: Array) -> Array:
