@@ -1,7 +1,12 @@
-"""Scenes of the coarse correction: bodies that fly, land, slide, tip, roll, hang and are gripped."""
+"""Scenes of the coarse correction: bodies that fly, land, slide, tip, roll, hang and are gripped.
+
+`python benchmarks/coarse_scenes.py 16 1e5 1e7` prints the errors of a course after 16 iterations a step, with
+corrections before and after them, and with further ones after every fourth.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -187,3 +192,20 @@ def scenes(youngs: float, cells: int = 4) -> dict[str, Course]:
     for mu in (0.0, 0.8):
         out[f"bar falls {mu}"] = course(falling, youngs, ground(mu))
     return out
+
+
+def main(iterations: int, stiffness: list[float]) -> None:
+    print(f"{'scene':26s}{'youngs':>8s}{'both ends':>12s}{'every 4th':>12s}")
+    for youngs in stiffness:
+        for name, chosen in scenes(youngs).items():
+            exact = chosen.converged()
+            runs = [
+                chosen.run(lambda problem, every=every: coarse_chebyshev(problem, iterations=iterations, every=every))
+                for every in (0, 4)
+            ]
+            errors = "".join(f"{error(chosen, run, exact):12.1e}" for run in runs)
+            print(f"{name:26s}{youngs:8.0e}{errors}", flush=True)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), [float(word) for word in sys.argv[2:]])

@@ -143,8 +143,10 @@ class RigidMotions:
         return 0.5 * float(self.problem.weight[self.vertices] @ (left**2).sum(axis=1))
 
 
-def correct(problem: StepProblem, displacement: Array, forces: Array, pairs: PairContacts | None = None) -> Array:
-    """Displacement [V, 3] m after the coarse correction of every island.
+def correct(
+    problem: StepProblem, displacement: Array, forces: Array, pairs: PairContacts | None = None
+) -> tuple[Array, Array]:
+    """The coarse correction of every island: displacement [V, 3] m, and forces [m, 3] N of the pairs after it.
 
     Args:
         problem: the step.
@@ -152,33 +154,29 @@ def correct(problem: StepProblem, displacement: Array, forces: Array, pairs: Pai
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
     """
-    corrected = displacement.copy()
-    for bodies, own in islands(problem, pairs):
-        corrected = _correct_island(RigidMotions(problem, corrected, bodies), forces, own)
-    return corrected
+    corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
+    for bodies, of in islands(problem, pairs):
+        own = None if pairs is None or not len(of) else pairs.chosen(of)
+        corrected, each = _correct_island(RigidMotions(problem, corrected, bodies), forces, own)
+        after[of] = each[len(each) - len(of) :]
+    return corrected, after
 
 
-def islands(
-    problem: StepProblem, pairs: PairContacts | None = None
-) -> Iterator[tuple[tuple[Index, ...], PairContacts | None]]:
-    """The bodies of every island, as their vertices, and its pairs."""
+def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
+    """The bodies of every island, as their vertices, and the numbers of its pairs."""
     component = problem.values.component
+    ends = np.zeros((0, 2), np.int64) if pairs is None else component[pairs.vertices[:, [0, 3]]]
     count = int(component.max()) + 1
-    number = np.arange(count)
-    if pairs is not None:
-        ends = component[pairs.vertices[:, [0, 3]]]
-        links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-        number = connected_components(links, directed=False)[1]
+    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    number = connected_components(links, directed=False)[1]
     for island in range(int(number.max()) + 1):
         members = np.flatnonzero(number == island)
-        own = None
-        if pairs is not None:
-            of = number[component[pairs.vertices[:, 0]]] == island
-            own = PairContacts(*(getattr(pairs, name)[of] for name in pairs.__dataclass_fields__)) if of.any() else None
-        yield tuple(np.flatnonzero(component == body) for body in members), own
+        bodies = tuple(np.flatnonzero(component == body) for body in members)
+        yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(rigid: RigidMotions, forces: Array, pairs: PairContacts | None) -> Array:
+def _correct_island(rigid: RigidMotions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array]:
+    """Displacement [V, 3] m and forces [m, 3] N of all contacts after the correction."""
     problem, vertices = rigid.problem, np.concatenate(rigid.bodies)
     contacts = contacts_at(problem, rigid.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
@@ -202,7 +200,7 @@ def _correct_island(rigid: RigidMotions, forces: Array, pairs: PairContacts | No
         radius = contacts.friction * trial.normal_forces()
         if np.abs(moved - still.displacement).max() < EXACT * rigid.size:
             break
-    return _pushed(rigid, contacts, radius)
+    return _pushed(rigid, contacts, radius), contacts.forces(radius)
 
 
 def _settled(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, radius: Array) -> tuple[Array, Array]:

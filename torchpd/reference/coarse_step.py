@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse import RigidMotions, correct, islands
+from .coarse import EXACT, PASSES, RigidMotions, correct, islands
 from .envelopes import pushes_of
 from .schedules import Guarded
 from .solvers import guard_tolerance
@@ -17,17 +17,15 @@ from .solvers import guard_tolerance
 if TYPE_CHECKING:
     from .problem import StepProblem
 
-__all__ = ["coarse_chebyshev", "corrected", "first_iterate"]
+__all__ = ["coarse_chebyshev", "corrected", "energies", "first_iterate", "rigid_fit"]
 
 Array = NDArray[np.float64]
-
-FITS = 2  # Newton steps of the rigid fit to h v
 
 
 def corrected(problem: StepProblem, displacement: Array, gradient: Array | None = None) -> Array:
     """Displacement [V, 3] m after a coarse correction, from the forces of the contacts at the iterate."""
     gradient = problem.gradient(displacement) if gradient is None else gradient
-    return correct(problem, displacement, pushes_of(problem, displacement, gradient))
+    return correct(problem, displacement, pushes_of(problem, displacement, gradient))[0]
 
 
 def first_iterate(problem: StepProblem) -> Array:
@@ -39,19 +37,22 @@ def first_iterate(problem: StepProblem) -> Array:
     pull = np.where(problem.free[:, None], problem.weight[:, None] * (still - problem.target), 0.0)
     forces = pushes_of(problem, still, problem.gradient(still) - pull)
     guess = problem.hold(problem.time_step * problem.velocities)
-    kept = correct(problem, _rigid_fit(problem, still, guess), forces)
+    kept = correct(problem, rigid_fit(problem, still, guess), forces)[0]
     moved = corrected(problem, problem.project(guess))
     lower, component = energies(problem, moved) < energies(problem, kept), problem.values.component
     return np.where(lower[component, None], moved, kept)
 
 
-def _rigid_fit(problem: StepProblem, displacement: Array, goal: Array) -> Array:
+def rigid_fit(problem: StepProblem, displacement: Array, goal: Array) -> Array:
     """The rigid motions [V, 3] m of the bodies that bring an iterate nearest to a goal; contacts are ignored."""
     toward = replace(problem, target=goal)
     for bodies, _ in islands(problem):
-        for _ in range(FITS):
+        for _ in range(PASSES):
             rigid = RigidMotions(toward, displacement, bodies)
-            displacement = rigid.moved(np.asarray(-np.linalg.solve(rigid.hessian, rigid.gradient), np.float64))
+            twists = np.asarray(-np.linalg.solve(rigid.hessian, rigid.gradient), np.float64)
+            displacement = rigid.moved(twists)
+            if np.abs(rigid.modes @ twists).max(initial=0.0) < EXACT * rigid.size:
+                break
     return displacement
 
 

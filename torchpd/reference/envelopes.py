@@ -12,7 +12,7 @@ the contact has chosen the push p of its vertices: p_a = w_a (f - f0) / D_a, wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -40,6 +40,10 @@ class PairContacts:
     offsets: Array  # [m] gap at u = 0, m
     friction: Array  # [m]
     forces: Array  # [m, 3] l n + t on the side of positive weights, N
+
+    def chosen(self, of: Index) -> PairContacts:
+        """Some of the contacts."""
+        return PairContacts(*(getattr(self, item.name)[of] for item in fields(self)))
 
 
 @dataclass(frozen=True)
