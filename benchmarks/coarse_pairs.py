@@ -105,7 +105,7 @@ def nearest_face(point: Array, corners: Array) -> tuple[int, Array, Array, float
     return number, shares[number], areas[number] / np.sqrt(squares[number]), float(gaps[number])
 
 
-def scenes(youngs: float, cells: int = 3) -> dict[str, Bodies]:
+def scenes(youngs: float, cells: int = 2) -> dict[str, Bodies]:
     """All scenes by name; a cube has so many cells an edge."""
     cube = box((0.1,) * 3, (cells,) * 3)
 
@@ -136,7 +136,7 @@ def main(iterations: int, stiffness: list[float]) -> None:
     print(f"{'scene':20s}{'youngs':>8s}{'alone':>10s}{'both ends':>12s}{'every 4th':>12s}")
     for youngs in stiffness:
         for name, chosen in scenes(youngs).items():
-            exact = chosen.run(4000)
+            exact = chosen.run(1000)
             options = ({"corrections": False}, {}, {"every": 4})
             errors = "".join(f"{chosen.error(chosen.run(iterations, **o), exact):12.1e}" for o in options)
             print(f"{name:20s}{youngs:8.0e}{errors}", flush=True)

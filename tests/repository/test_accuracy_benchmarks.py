@@ -387,3 +387,21 @@ def test_what_a_gradient_costs() -> None:
     row = measure_scene((2, 1, 1), 1, 1e5, "Chebyshev", torch.device("cpu"), 0.0, "multilevel")
     assert row["backward"] > 0
     assert "| Chebyshev, multilevel adjoint made in 2 s |" in line_of({**row, "making": 2.0})
+
+
+@pytest.mark.usefixtures("on_path")
+def test_corrections_of_solved_tumbles_are_counted() -> None:
+    import coarse
+
+    def step(moved: float, error: float) -> dict[str, float]:
+        return {"moved": moved, "moved between": 0.0, "error alone": 1.0, "error": error}
+
+    counts = coarse.summary([{"solved": [step(2e-8, 1e-4)]}, {"solved": [step(1e-9, 1e-2)]}, {"solved": []}])
+    assert counts["solved steps"] == 2
+    assert counts["moved"] == {"furthest": 2e-8, "by more than 1e-08 m": 1}
+    assert counts["moved between"] == {"furthest": 0.0, "by more than 1e-08 m": 0}
+    assert counts["error"]["geometric mean"] == pytest.approx(1e-3)
+    assert counts["error"]["worst"] == 1e-2
+    found = coarse.run_scene(2)["solved"]
+    assert len(found) == 8
+    assert all(row["error"] <= row["error alone"] for row in found)
