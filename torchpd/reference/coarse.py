@@ -207,7 +207,8 @@ def _settled(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, radius: 
     """Twists [N] of the quadratic model, and friction radii [m] N near those of the normal forces that they leave.
 
     Radii that follow the normal forces at once oscillate where a stiff body lands on rough ground; half of the way
-    settles. The twists minimise the model for the radii returned, which the guard needs.
+    settles. Each radius waits for the minimum: an unfinished one leads to other contact forces in a rough corner. The
+    twists minimise the model for the radii returned, which the guard needs.
     """
     twists = np.zeros(len(rigid.gradient))
     for _ in range(SETTLE - 1):
