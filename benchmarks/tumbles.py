@@ -79,9 +79,13 @@ def residual_of(problem: StepProblem, u: NDArray[np.float64]) -> float:
     return problem.relative_residual(u)
 
 
+def still_problem(problem: StepProblem) -> Still:
+    return Still(**{field.name: getattr(problem, field.name) for field in fields(problem)})
+
+
 def judge(problem: StepProblem, u: NDArray[np.float64]) -> Row:
     """Remaining fraction of the residual after iterations alone, and displacement by the rigid motion after it [m]."""
-    still = Still(**{field.name: getattr(problem, field.name) for field in fields(problem)})
+    still = still_problem(problem)
     solved = guarded_chebyshev(still, u, iterations=1500).displacement
     return {
         "residual of iterations": residual_of(problem, solved),

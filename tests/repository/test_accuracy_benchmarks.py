@@ -401,3 +401,21 @@ def test_accuracy_by_kind_counts_iterations_and_draws(tmp_path: Path) -> None:
     assert row["default"]["error"] > 0.1
     run("accuracy_by_kind.py", "--draw", str(out))
     assert out.with_suffix(".png").stat().st_size > 1000
+
+
+@pytest.mark.usefixtures("on_path")
+def test_corrections_of_solved_tumbles_are_counted() -> None:
+    import coarse
+
+    def step(moved: float, error: float) -> dict[str, float]:
+        return {"moved": moved, "moved between": 0.0, "error alone": 1.0, "error": error}
+
+    counts = coarse.summary([{"solved": [step(2e-8, 1e-4)]}, {"solved": [step(1e-9, 1e-2)]}, {"solved": []}])
+    assert counts["solved steps"] == 2
+    assert counts["moved"] == {"furthest": 2e-8, "by more than 1e-08 m": 1}
+    assert counts["moved between"] == {"furthest": 0.0, "by more than 1e-08 m": 0}
+    assert counts["error"]["geometric mean"] == pytest.approx(1e-3)
+    assert counts["error"]["worst"] == 1e-2
+    found = coarse.run_scene(2)["solved"]
+    assert len(found) == 8
+    assert all(row["error"] <= row["error alone"] for row in found)

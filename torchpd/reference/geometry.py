@@ -1,4 +1,4 @@
-"""Shape gradients of elements, the bound of their majoriser, and the sparse operator of deformation gradients."""
+"""Shape gradients of elements, the bound of their majoriser, the sparse operator of deformation gradients; normals."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-__all__ = ["Elements", "elements", "gradient_operator", "spreads"]
+__all__ = ["Elements", "elements", "gradient_operator", "sphere_normals", "spreads"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -50,3 +50,10 @@ def gradient_operator(gradients: Array, corners: Index, count: int) -> csr_array
     columns = np.repeat(corners, width, axis=0).reshape(-1)
     entries = np.swapaxes(gradients, 1, 2).reshape(-1)
     return csr_array((entries, (rows, columns)), shape=(width * number, count))
+
+
+def sphere_normals(positions: Array, center: Array) -> tuple[Array, Array]:
+    """Outward normals [V, 3] of a sphere at positions, upward at its centre, and distances [V] m from the centre."""
+    arms = positions - center
+    lengths = np.linalg.norm(arms, axis=1, keepdims=True)
+    return np.where(lengths > 0.0, arms / np.maximum(lengths, 1e-300), [0.0, 1.0, 0.0]), lengths[:, 0]

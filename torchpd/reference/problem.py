@@ -15,6 +15,7 @@ nu = 0, w / 2 |F - R|^2 with R the nearest rotation. Hard pins hold u_i = target
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,6 +25,7 @@ from scipy.sparse import csr_array, diags_array
 
 from ..common.tables import PLANES, SPHERES
 from ..scene.scene import SceneValues
+from .geometry import sphere_normals
 from .groups import ElementGroup, groups_of
 from .rigid import align, begin
 from .rigid_piece import gaps_of
@@ -169,19 +171,23 @@ class StepProblem:
         pass their current iterate as `around`. With the normal of the unprojected step, the point where friction
         comes to rest would depend on the step length.
         """
+        *_, moved = displacement, *self.projections(displacement, displacement if around is None else around)
+        return np.where(self.free[:, None], moved, displacement)
+
+    def projections(self, displacement: Array, around: Array) -> Iterator[Array]:
+        """The displacement [V, 3] m after the projection out of each plane, then out of each sphere; see `project`."""
         moved = displacement
         for plane in self.values.planes:
             normal = plane[PLANES["normal"]]
             gaps = (self.positions + moved) @ normal - plane[PLANES["height"]]
             normals = np.broadcast_to(normal, moved.shape)
             moved = _push_out(moved, normals, gaps, np.zeros(3), float(plane[PLANES["friction"]]))
+            yield moved
         for center, motion, sphere in zip(self.sphere_centers, self.sphere_motions, self.values.spheres, strict=True):
-            arms = self.positions + (moved if around is None else around) - center
-            lengths = np.linalg.norm(arms, axis=1, keepdims=True)
-            normals = np.where(lengths > 0.0, arms / np.maximum(lengths, 1e-300), [0.0, 1.0, 0.0])
+            normals, _ = sphere_normals(self.positions + around, center)
             gaps = ((self.positions + moved - center) * normals).sum(axis=1) - sphere[SPHERES["radius"]]
             moved = _push_out(moved, normals, gaps, motion, float(sphere[SPHERES["friction"]]))
-        return np.where(self.free[:, None], moved, displacement)
+            yield moved
 
     def residual(self, displacement: Array, diagonal: Array | None = None) -> Array:
         """D (u - P(u - g / D)) [V, 3] N: zero at a solution, grad E where nothing touches; D is Dbar by default."""

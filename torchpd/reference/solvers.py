@@ -13,6 +13,7 @@ from scipy.sparse.linalg import eigsh, splu
 
 from ..common.tables import PLANES, SPHERES
 from .problem import StepProblem
+from .schedules import Classic, Guarded, Plain
 
 __all__ = [
     "Iterates",
@@ -45,60 +46,16 @@ class Iterates:
     converged: bool = False  # stopped by the tolerance
 
 
-class _Plain:
-    """Jacobi iteration: omega = 1."""
-
-    def omega(self, iteration: int) -> float:
-        return 1.0
-
-    def check(self, energy: float) -> bool:
-        return False
-
-
-class _Classic:
-    """The recurrence of Wang 2015: 1 before the delay S, 2 / (2 - rho^2) at S, 4 / (4 - rho^2 omega) after it."""
-
-    def __init__(self, rho: float, delay: int) -> None:
-        self.rho, self.delay, self.last = rho, delay, 1.0
-
-    def omega(self, iteration: int) -> float:
-        if iteration >= self.delay:
-            at_start = iteration == self.delay
-            self.last = 2.0 / (2.0 - self.rho**2) if at_start else 4.0 / (4.0 - self.rho**2 * self.last)
-        return self.last
-
-    def check(self, energy: float) -> bool:
-        return False
-
-
-class _Guarded:
-    """Momentum age / (age + 3), up to the limit of Chebyshev's recurrence; restarts when the energy has risen."""
-
-    def __init__(self, rho: float, tolerance: float) -> None:
-        self.limit = ((1.0 - np.sqrt(1.0 - rho**2)) / rho) ** 2 if rho > 0.0 else 0.0
-        self.tolerance, self.age, self.last = tolerance, 0, np.inf
-
-    def omega(self, iteration: int) -> float:
-        momentum = min(self.limit, self.age / (self.age + 3.0))
-        self.age += 1
-        return 1.0 + momentum
-
-    def check(self, energy: float) -> bool:
-        risen = energy > self.last * (1.0 + self.tolerance)
-        self.age, self.last = 0 if risen else self.age, energy
-        return bool(risen)
-
-
 def classic_omegas(rho: float, delay: int, iterations: int) -> list[float]:
     """The weights omega_0 .. omega_{K-1} of the classic schedule."""
-    schedule = _Classic(rho, delay)
+    schedule = Classic(rho, delay)
     return [schedule.omega(k) for k in range(iterations)]
 
 
 def _iterate(
     problem: StepProblem,
     first: Array,
-    schedule: _Plain | _Classic | _Guarded,
+    schedule: Plain | Classic | Guarded,
     *,
     diagonal: Array,
     relaxation: float,
@@ -169,7 +126,7 @@ def jacobi(
 ) -> Iterates:
     """Jacobi iteration; `observe(k, u_k)` is called with every iterate from the first update on."""
     diagonal = problem.weighted_diagonal if weighted else problem.plain_diagonal
-    return _iterate(problem, first, _Plain(), diagonal=diagonal, relaxation=relaxation, iterations=iterations,
+    return _iterate(problem, first, Plain(), diagonal=diagonal, relaxation=relaxation, iterations=iterations,
                     tolerance=tolerance, observe=observe)  # fmt: skip
 
 
@@ -187,7 +144,7 @@ def classic_chebyshev(
 ) -> Iterates:
     """Classic Chebyshev iteration of the source paper; rho estimates the spectral radius of the Jacobi iteration."""
     diagonal = problem.weighted_diagonal if weighted else problem.plain_diagonal
-    return _iterate(problem, first, _Classic(rho, delay), diagonal=diagonal, relaxation=relaxation,
+    return _iterate(problem, first, Classic(rho, delay), diagonal=diagonal, relaxation=relaxation,
                     iterations=iterations, tolerance=tolerance, observe=observe)  # fmt: skip
 
 
@@ -208,7 +165,7 @@ def guarded_chebyshev(
     `guard_tolerance`).
     """
     radius = min(0.99999, 1.0 - relaxation * problem.smallest_ratio if rho is None else rho)
-    schedule = _Guarded(radius, guard_tolerance(problem) if check_tolerance is None else check_tolerance)
+    schedule = Guarded(radius, guard_tolerance(problem) if check_tolerance is None else check_tolerance)
     return _iterate(problem, first, schedule, diagonal=problem.weighted_diagonal, relaxation=relaxation,
                     iterations=iterations, tolerance=tolerance, observe=observe)  # fmt: skip
 
