@@ -73,9 +73,9 @@ def run_scene(name: str, device: torch.device, seconds: float) -> Row:
     wide = scene.state()
     row: Row = {"scene": name, "title": scene.title, "time_step": scene.time_step}
     sim = scene.simulator(torch.float32, DEFAULT_ITERATIONS)
-    exact = exact_steps(sim, pd.State(*(part.float() for part in wide)))[0]
+    exact = exact_steps(sim, wide.to(torch.float32))[0]
     sim = sim.to(device)
-    state = pd.State(*(part.to(device, torch.float32) for part in wide))
+    state = wide.to(device, torch.float32)
     row.update(
         vertices=sim.vertices, kernel=sim.plan.kernel, uncertainty=exact.uncertainty,
         rounding=exact.rounding(torch.float32) / exact.scale, default_iterations=sim.iterations, solvers={},

@@ -40,7 +40,7 @@ class EffectScene:
         self.start(state)
         for _ in range(self.steps_before):
             state = sim(state)
-        return pd.State(*(part.float().double() for part in state))
+        return state.to(torch.float32).to(torch.float64)
 
 
 def _beam(poisson: float) -> EffectScene:
@@ -96,8 +96,19 @@ def _draped_scene() -> pd.Scene:
     )  # fmt: skip
 
 
+def _plastic_scene() -> pd.Scene:
+    """A bar that is thrown sideways so hard that it yields near its held end."""
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (20, 4, 4))
+    body = pd.Solid(mesh, youngs=1e6, poisson=0.3, plastic=pd.Plastic(yield_strain=0.02))
+    return pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity(GRAVITY))
+
+
 def _thrown(state: pd.State) -> None:
     state.velocities[..., 1] = -2.0 * state.positions[..., 0] ** 2
+
+
+def _flung(state: pd.State) -> None:
+    state.velocities[..., 1] = -10.0 * state.positions[..., 0] ** 2
 
 
 def _swung(state: pd.State) -> None:
@@ -112,6 +123,7 @@ EFFECT_SCENES = {
     "beam 0": _beam(0.0),
     "beam 0.3": _beam(0.3),
     "beam 0.45": _beam(0.45),
+    "plastic": EffectScene("bar that yields, 1e6 Pa, nu = 0.3", _plastic_scene, 1 / 60, _flung, steps_before=4),
     "cloth 1e3": _cloth(1e3),
     "cloth 1e4": _cloth(1e4),
     "rod": EffectScene("rod, 1e7 Pa", _rod_scene, 1 / 60, _thrown, steps_before=4),

@@ -30,9 +30,10 @@ from ..reference.problem import StepProblem, step_problem
 from ..scene.effects import Ground, Sphere
 from ..scene.scene import Part, Scene
 from ..scene.solvers import Chebyshev, Multilevel, Solver
+from ..scene.stencils import StencilGroup
 from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
-from ..simulation.state import State
+from ..simulation.state import History, HistoryState, State
 from ..simulation.surface_loads import SurfaceLoads
 from .candidates import multilevel_for
 from .unsolved_step import ROUNDINGS
@@ -155,13 +156,18 @@ def frictionless(sim: Stepper, dtype: torch.dtype | None = None) -> Stepper:
 
 
 def problem_of(
-    sim: Stepper, state: State, item: int = 0, *, forces: Tensor | None = None, targets: Targets | None = None
+    sim: Stepper,
+    state: State | HistoryState,
+    item: int = 0,
+    *,
+    forces: Tensor | None = None,
+    targets: Targets | None = None,
 ) -> StepProblem:
     """One environment's step in the reference, with the simulator's present material and without friction.
 
     Its forces are `forces` and those of pressure and wind.
     """
-    arrays = sim.material_at(targets, state[0].shape[0])
+    arrays = sim.with_history(sim.material_at(targets, state[0].shape[0]), state)
     forces = expand_shared(forces, state[0].shape)
     pushed = None if forces is None else _double(forces[item])
     material = {}
@@ -171,6 +177,10 @@ def problem_of(
     if sim.loads is not None:
         loads = _load_forces(sim, state, item, material["masses"], targets)
         pushed = loads if pushed is None else pushed + loads
+
+    def changing(group: StencilGroup) -> set[str]:
+        return set(group.trainable) | set(group.material).intersection(History._fields)
+
     planes, spheres = material["planes"], material["spheres"]
     planes[:, PLANES["friction"]] = 0.0
     spheres[:, SPHERES["friction"]] = 0.0
@@ -188,7 +198,7 @@ def problem_of(
         damping=float(material["damping"]),
         poisson=None if values.poisson is None else material["poisson"],
         stencils=tuple(
-            dataclasses.replace(group, material=group.material | {name: material[name] for name in group.trainable})
+            dataclasses.replace(group, material=group.material | {name: material[name] for name in changing(group)})
             for group in values.stencils
         ),
     )
@@ -203,7 +213,7 @@ def problem_of(
     )
 
 
-def _load_forces(sim: Stepper, state: State, item: int, masses: Array, targets: Targets | None) -> Array:
+def _load_forces(sim: Stepper, state: State | HistoryState, item: int, masses: Array, targets: Targets | None) -> Array:
     """Forces of pressure and wind on one environment [V, 3] N, evaluated in float64."""
     loads = SurfaceLoads.of(sim.scene, torch.float64, torch.device("cpu"))
     assert loads is not None
@@ -223,6 +233,11 @@ def _wide(tensor: Tensor) -> Tensor:
     return tensor.detach().to("cpu", torch.float64)
 
 
+def _wide_state(state: State | HistoryState) -> State | HistoryState:
+    kept = state if isinstance(state, HistoryState) else State(*state)
+    return kept.detach().to("cpu", torch.float64)
+
+
 def _double(tensor: Tensor) -> Array:
     return tensor.detach().double().cpu().numpy().copy()
 
@@ -230,7 +245,7 @@ def _double(tensor: Tensor) -> Array:
 @torch.no_grad()
 def exact_steps(
     sim: Stepper,
-    state: State,
+    state: State | HistoryState,
     *,
     forces: Tensor | None = None,
     targets: Targets | None = None,
@@ -272,7 +287,7 @@ def exact_steps(
 
 @torch.no_grad()
 def settled_steps(
-    sim: Stepper, state: State, *, forces: Tensor | None = None, enough: float = _SURE
+    sim: Stepper, state: State | HistoryState, *, forces: Tensor | None = None, enough: float = _SURE
 ) -> list[ExactStep]:
     """The step of every environment with its friction, if iterations from "velocity" settle.
 
@@ -290,9 +305,9 @@ def settled_steps(
         twin = plain_copy(sim)
         twin.solver, twin.tolerance = Chebyshev(), 0.0
         twin = twin.to("cpu", torch.float64)
-        wide, pushed = State(_wide(state[0]), _wide(state[1])), None if forces is None else _wide(forces)
+        wide, pushed = _wide_state(state), None if forces is None else _wide(forces)
 
-        def run(solver: Solver, iterations: int, start: str | Tensor = "velocity") -> State:
+        def run(solver: Solver, iterations: int, start: str | Tensor = "velocity") -> State | HistoryState:
             twin.solver, twin.iterations = solver, iterations
             return twin(wide, pushed, start=start)
 
@@ -322,12 +337,14 @@ def settled_steps(
 class _Search:
     """Search for the converged steps of a batch; keeps the best result of each environment."""
 
-    def __init__(self, sim: Stepper, state: State, forces: Tensor | None, targets: Targets | None, start: str) -> None:
+    def __init__(
+        self, sim: Stepper, state: State | HistoryState, forces: Tensor | None, targets: Targets | None, start: str
+    ) -> None:
         # the CPU runs all solvers; a GPU's kernel may not
         self.twin = frictionless(sim)
         self.twin.solver = Chebyshev()
         self.twin = self.twin.to("cpu", torch.float64)
-        self.state = State(_wide(state[0]), _wide(state[1]))
+        self.state = _wide_state(state)
         self.forces = None if forces is None else _wide(forces)
         self.targets = _wide(targets) if isinstance(targets, Tensor) else _widened(targets)
         self.problems = [problem_of(sim, state, item, forces=forces, targets=targets) for item in range(len(state[0]))]

@@ -14,7 +14,7 @@ from torch import Tensor
 from .. import _C
 from ..common.checks import plain_tensor
 from ..common.gpu import check_free_memory, free_memory, properties_of, unavailable_reason, visible_devices
-from ..common.tables import EFFECT_ROWS
+from ..common.tables import EFFECT_ROWS, KINDS
 from ..ops.diagonal import pinned_vertices
 from ..scene.solvers import Multilevel
 from .compiled import CompiledScene

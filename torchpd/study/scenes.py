@@ -106,7 +106,7 @@ def _sheet_scene(mesh: TriMesh, youngs: float, poisson: float = 0.0) -> Scene:
 
 
 def _sheet_start(sim: Simulator) -> State:
-    state = sim.rest_state()
+    state: State = sim.rest_state()
     state.velocities[..., 1] = 3.0 * state.positions[..., 0] ** 2
     return state
 
