@@ -286,6 +286,11 @@ DeviceStencils<T> device_stencils_view(at::TensorList arrays, int patches, const
   count_rows(count, row_sizes, patches);
   DeviceStencils<T> stencils = count_device_stencils<T>(
       arrays[device_plan_arrays].const_data_ptr<int32>(), row_sizes.const_data_ptr<int32>());
+  const int32* const counts =
+      arrays[device_plan_arrays].const_data_ptr<int32>() + stencil_size_count;
+  TORCH_CHECK_VALUE(!any_kind(counts, [](auto kind) { return !runs_on_gpu<decltype(kind)>; }),
+                    "plan must have stencils that a GPU has kernels for, got some with a history; "
+                    "step plastic solids on the CPU");
   const Place on_cpu{at::kCPU, "every plan's sizes"};
   int at = device_plan_arrays;
   using real = T;

@@ -259,7 +259,6 @@ void run_stencil_vertices(const MixedFieldWork<T>& work, cudaStream_t stream) {
 template <class T>
 void run_damping(const MixedFieldWork<T>& work, cudaStream_t stream) {
   if constexpr (has_large_kinds) {
-    begin_stencils(work.stencils, work.field.plan, work.field.positions, work.field.batch, stream);
     switch (work.field.field) {
       case Field::damping_gradient:
         return run_stencil_vertices<Dissipating<StencilGradient<false>>, 1>(work, stream);
@@ -306,6 +305,9 @@ void run_mixed_field(const MixedField<T>& field, void* memory, Stream to) {
   const MixedFieldWork<T> work = arrange_mixed(arena, field);
   if (field.field == Field::stiffness_at_rest) return run_stiffness(work, stream);
   compute_stencil_numbers(work.stencils, field.effects, field.batch, stream);
+  // a diagonal has no positions, and needs no memory
+  if (field.positions)
+    begin_stencils(work.stencils, field.plan, field.positions, field.batch, stream);
   if (field.field == Field::effect_energy) return run_energies(work, stream);
   if (field.field == Field::effect_products) {
     return field.direction ? run_products<true>(work, false, stream)
