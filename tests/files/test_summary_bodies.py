@@ -42,4 +42,4 @@ def test_auto_takes_chebyshev_for_thin_bodies() -> None:
         sim = pd.Simulator(pd.Scene(body, pd.Gravity()), solver="auto")
         assert isinstance(sim.solver, pd.Chebyshev)
         assert sim.choice is not None
-        assert "a part besides solids may stall Multilevel" in sim.choice.why
+        assert "other elements than plain tetrahedra may stall Multilevel" in sim.choice.why

@@ -203,10 +203,16 @@ for _base in Simulator.__mro__[1:]:
             _method.__qualname__ = f"Simulator.{_name}"
 
 
+_NONE = torch.zeros(0)
+
+
 def _restored(saved: SavedSimulation) -> Simulator:
     sim = Simulator(saved.scene, **saved.settings)
-    sim.set_material(**saved.material)
-    for name in saved.trained:
+    # files from before a flat scene left it out have its zeros
+    flat = "rest_curvature" not in sim.material_names and not bool(saved.material.get("rest_curvature", _NONE).any())
+    left_out = {"rest_curvature"} if flat else set()
+    sim.set_material(**{name: array for name, array in saved.material.items() if name not in left_out})
+    for name in set(saved.trained) - left_out:
         getattr(sim, name).requires_grad_()
     reference = saved.reference
     # the bits of a preconditioner follow from mesh, stiffness and inertia

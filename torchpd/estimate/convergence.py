@@ -214,9 +214,9 @@ def has_friction(compiled: CompiledScene) -> bool:
 
 
 def held_up_by(compiled: CompiledScene) -> str:
-    """Obstacle to the convergence of `Multilevel`: other parts than solids, friction, a ball (sheets buckle), or ""."""
+    """Obstacle to the convergence of `Multilevel`: other elements, friction, a ball (sheets buckle), or ""."""
     if compiled.has_stencils:
-        return "a part besides solids"
+        return "other elements than plain tetrahedra"
     if has_friction(compiled):
         return "friction"
     return "a ball" if compiled.named["spheres"].shape[-2] else ""

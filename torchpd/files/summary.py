@@ -77,8 +77,9 @@ def _expectation_lines(sim: Stepper) -> list[str]:
         hardest = " when a stiff body lands" if has_contacts(scene) else " in the worst case"
         hardest = hardest if is_bound(scene) else ""
         counts = " and ".join(f"{error:g} after {expected.words(error)}" for error in (1e-2, 1e-3))
+        buckles = any(isinstance(body, (Cloth, Rod)) for body in sim.scene.bodies)
         # compressed parts have a smaller second derivative than inertia alone, which no weight knows
-        verdict += "; more where cloth or rods buckle" if scene.has_stencils and not is_bound(scene) else ""
+        verdict += "; more where cloth or rods buckle" if buckles and not is_bound(scene) else ""
         lines.append(f"expected{hardest}: an error of {counts} iterations, estimated from the weights{verdict}")
         if sim.tolerance and expected.iterations(sim.tolerance) > sim.iterations:
             words = expected.words(sim.tolerance)
@@ -133,9 +134,10 @@ def _effect_lines(sim: Stepper) -> list[str]:
 
 def _body_lines(scene: Scene) -> list[str]:
     lines = []
-    if scene.solids:
-        tets = sum(len(solid.mesh.tets) for solid in scene.solids)
-        lines.append(f"solids: {len(scene.solids)} ({tets} tetrahedra), one local step per iteration")
+    elastic = scene.elastic_solids
+    if elastic:
+        tets = sum(len(solid.mesh.tets) for solid in elastic)
+        lines.append(f"solids: {len(elastic)} ({tets} tetrahedra), one local step per iteration")
     groups = [
         solid.averaging_groups
         for solid in scene.elastic_solids

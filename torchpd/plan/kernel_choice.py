@@ -68,7 +68,8 @@ _PIPELINE_GROWTH, _PIPELINE_BYTES = 1.2, 200_000
 _TET_ENTRIES = 2.5  # entries of a tetrahedron in shared memory: five of a pair
 _ROW_SHARE = 0.25  # of the corners of quadratic stencils that count as entries when a stream is cut into patches
 _STENCIL_KERNELS = ("block", "stream")
-OTHER_BODIES = "cloth, rods, springs, ties or fibres"  # what has stencils, for errors
+# what has stencils, for errors
+OTHER_BODIES = "cloth, rods, springs, ties, fibres, strain limits, the volume law or stiffness-proportional damping"
 _MAX_PASS_FIELDS = 2  # most fields of one pass: the products with a second derivative
 
 

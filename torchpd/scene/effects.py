@@ -147,15 +147,16 @@ class Solid(Body):
         if not isinstance(plastic, Plastic):
             raise TypeError(f"Solid.plastic must be a Plastic or None, got {type(plastic).__name__}")
         plastic.rows(len(self.mesh.tets))
+        alone = self.averaging is None or np.array_equal(self.averaging, 1)
         refused = {
-            'law must be "corotated"': self.law != "corotated",
-            "averaging must be 1 or None": not (self.averaging is None or np.array_equal(self.averaging, 1)),
-            "stiffness_damping must be 0": not isinstance(self.stiffness_damping, float),
+            'law must be "corotated"': (self.law, self.law != "corotated"),
+            "averaging must be 1 or None": (self.averaging, not alone),
+            "stiffness_damping must be 0": ("another", not isinstance(self.stiffness_damping, float)),
         }
-        for contract, broken in refused.items():
+        for contract, (given, broken) in refused.items():
             if broken:
                 raise ValueError(
-                    f"Solid.{contract} beside plastic, whose elements have a law of their own, got another"
+                    f"Solid.{contract} beside plastic, whose elements have a law of their own, got {given!r}"
                 )
 
     @property

@@ -138,7 +138,10 @@ def _check_damped(owner: str, seconds: Tensor, scene: Scene) -> None:
 def _hint(name: str) -> str:
     """What to do instead of setting an array that a scene lacks."""
     if name == "poisson":
-        return "; every solid has poisson=0.0, which leaves it out: give Solid(poisson=) another number or an array"
+        return (
+            "; every elastic solid has poisson=0.0, which leaves it out: give Solid(poisson=) another number or an "
+            "array. Plastic solids have plastic_poisson"
+        )
     if name == "stiffness_damping":
         return "; every solid has stiffness_damping=0.0, which leaves it out: give Solid(stiffness_damping=)"
     if name == "rest_curvature":

@@ -13,7 +13,7 @@ from ..ops.adjoint import step_gradient
 from ..ops.diagonal import elastic_material, named_material
 from ..ops.energy import elastic_energy
 from ..ops.registration import INFO_WIDTH, refuse_forward_mode
-from ..plan.material import environments_of_material, named_arrays
+from ..plan.material import check_environments, environments_of_material, named_arrays
 from ..scene.targets import Targets
 from .readable import Readable
 from .rollout import PerStep, Rollout, run_rollout
@@ -43,10 +43,12 @@ class Stepper(Readable):
         count = (
             environments_of_material(named_arrays(self)) if batch is None else check_whole("batch", batch, minimum=0)
         )
+        history = self.history_at_rest()
+        if history is not None:
+            check_environments("Simulator.rest_state: batch", count, {"flow": history.flow})
         shape = (count, -1, -1)
         positions = self.rest_positions.expand(shape).clone()
         state = State(positions, torch.zeros_like(positions))
-        history = self.history_at_rest()
         if history is None:
             return state
         return HistoryState(*state, History(*(array.expand(count, *array.shape[-2:]).clone() for array in history)))
