@@ -53,7 +53,7 @@ def test_answers_name_what_is_there(owner: str, names: str, answer: str) -> None
 
 
 def test_other_unknown_arguments_get_the_list() -> None:
-    with pytest.raises(TypeError, match=r"^Solid has no argument 'yongs'; .*stiffness_damping$"):
+    with pytest.raises(TypeError, match=r"^Solid has no argument 'yongs'; .*stiffness_damping, plastic$"):
         pd.Solid(MESH, yongs=1e5)
     with pytest.raises(TypeError, match=r"^Scene has no argument 'wind'; "):
         pd.Scene(pd.Solid(MESH, youngs=1e5), wind=1.0)

@@ -83,7 +83,7 @@ def test_each_environment_steps_with_its_own(name: str) -> None:
         ({"bending": torch.ones(2, 4)}, r"bending must be \[42\].*got \[2, 4\]; hinges of the scene: 42"),
         ({"tie_stiffness": -2.0}, "tie_stiffness must be >= 0"),
         ({"fibre_length": math.nan}, "fibre_length must be finite"),
-        ({"poisson": 0.3}, r"no array 'poisson'.*every solid has poisson=0.0"),
+        ({"poisson": 0.3}, r"no array 'poisson'.*every elastic solid has poisson=0.0"),
         ({"activation": 0.3}, r"no array 'activation'.*targets"),
         ({"area_density": 0.3}, r"no array 'area_density'.*masses"),
     ],

@@ -80,7 +80,7 @@ def test_kernels_that_did_not_run_are_named(tool: dict[str, Any], capsys: pytest
     assert len(expected) > 200
     assert all(name.startswith("pd::") for name in expected)
     signatures = (
-        "void pd::fused_step<float, true, true, (pd::generic::Blocks)1, true, 512>(pd::FusedCall<float>)",
+        "void pd::generic::fused_step<float, true, true, (pd::generic::Blocks)1, true, 512>(pd::FusedCall<float>)",
         "void pd::freeform::freeform_items<pd::freeform::CellBoxes<double>>(pd::freeform::CellBoxes<double>, long)",
     )
     assert {tool["plain"](signature) for signature in signatures} < expected

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
@@ -32,7 +32,7 @@ class Stepper(Readable):
     # ---- states
 
     @check_arguments("Simulator.rest_state")
-    def rest_state(self, batch: int | None = None) -> Any:
+    def rest_state(self, batch: int | None = None) -> State:
         """The rest positions with zero velocities [batch, V, 3], and the history of a scene that keeps one.
 
         A `State`, or a `HistoryState` in scenes with plastic solids.
@@ -51,7 +51,9 @@ class Stepper(Readable):
         state = State(positions, torch.zeros_like(positions))
         if history is None:
             return state
-        return HistoryState(*state, History(*(array.expand(count, *array.shape[-2:]).clone() for array in history)))
+        kept = History(*(array.expand(count, *array.shape[-2:]).clone() for array in history))
+        # for type checkers scenes without plastic solids are the rule
+        return cast(State, HistoryState(*state, kept))
 
     def _after(self, positions: Tensor, velocities: Tensor, material: list[Tensor]) -> Any:
         """The state after a step with this material."""
