@@ -19,6 +19,7 @@ import torchpd as pd
 from torchpd.reference import step_problem
 from torchpd.reference.envelopes import PairContacts
 from torchpd.reference.pair_step import pair_chebyshev
+from torchpd.reference.pieces import Pieces
 
 Array = NDArray[np.float64]
 
@@ -36,7 +37,7 @@ class Bodies:
     parts: tuple[pd.Gravity | pd.Ground, ...]
     steps: int
 
-    def run(self, iterations: int, **options: int | bool) -> list[tuple[Array, Array]]:
+    def run(self, iterations: int, **options: int | bool | Pieces) -> list[tuple[Array, Array]]:
         """Positions and velocities after every step; multipliers are carried by vertex and body."""
         values = pd.Scene(*(pd.Solid(mesh, self.youngs, density=1000.0) for mesh in self.meshes), *self.parts).values()
         x, v, out, known = np.concatenate([mesh.vertices for mesh in self.meshes]), self.velocities, [], {}

@@ -1,16 +1,13 @@
 """Coarse correction of an iterate: the motions of bodies with the least energy, contacts as envelopes.
 
-`Motions` are those of an island, which is a body, or bodies that pairs join. `RigidMotions` are the twists q of bodies,
-`reference.piece_step` has those of their pieces.
-
 Each body moves by a twist q about its centre, as far as its hard pins leave it free; an island is a body, or bodies
 that pairs join. Elastic energy does not change, so q minimises
 
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
-with a fixed friction radius r. An outer step minimises the quadratic model of Phi by Newton passes, and moves r toward
-friction l in between. It halves the motion until Phi has not risen. The pushes p of the touching vertices follow. At a
-converged step q = 0 and p = 0.
+with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
+An outer step minimises the quadratic model of Phi by Newton passes, and moves r toward friction l in between. It halves
+the motion until Phi has not risen. The pushes p of the touching vertices follow. At a converged step q = 0 and p = 0.
 """
 
 from __future__ import annotations
@@ -32,7 +29,7 @@ from .geometry import twists
 if TYPE_CHECKING:
     from .problem import StepProblem
 
-__all__ = ["Motions", "RigidMotions", "correct", "islands"]
+__all__ = ["Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -179,13 +176,17 @@ class RigidMotions(Motions):
         return 0.5 * float(self.problem.weight[self.vertices] @ (left**2).sum(axis=1))
 
 
+# makes the motions of an island from the problem, the displacement and the vertices of its bodies
+MotionsOf = Callable[["StepProblem", Array, tuple[Index, ...]], Motions]
+
+
 def correct(
     problem: StepProblem,
     displacement: Array,
     forces: Array,
     pairs: PairContacts | None = None,
     *,
-    motions: Callable[[StepProblem, Array, tuple[Index, ...]], Motions] = RigidMotions,
+    motions: MotionsOf = RigidMotions,
 ) -> tuple[Array, Array]:
     """The coarse correction of every island: displacement [V, 3] m, and forces [m, 3] N of the pairs after it.
 
@@ -194,7 +195,7 @@ def correct(
         displacement: [V, 3] m; hard pins at their targets.
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
-        motions: makes the motions of an island from the problem, the displacement and the vertices of its bodies.
+        motions: makes the motions of an island.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
     for bodies, of in islands(problem, pairs):

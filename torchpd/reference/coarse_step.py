@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse import EXACT, PASSES, Motions, RigidMotions, correct, islands
+from .coarse import EXACT, PASSES, MotionsOf, RigidMotions, correct, islands
 from .envelopes import pushes_of
 from .piece_step import piece_motions
 from .pieces import Pieces, PieceSpace
@@ -22,14 +22,13 @@ if TYPE_CHECKING:
 __all__ = ["coarse_chebyshev", "corrected", "first_iterate", "rigid_fit"]
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 def corrected(
     problem: StepProblem,
     displacement: Array,
     gradient: Array | None = None,
-    motions: Callable[[StepProblem, Array, tuple[Index, ...]], Motions] = RigidMotions,
+    motions: MotionsOf = RigidMotions,
 ) -> Array:
     """Displacement [V, 3] m after a coarse correction, from the forces of the contacts at the iterate."""
     gradient = problem.gradient(displacement) if gradient is None else gradient

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse import Motions
+from .coarse import Motions, MotionsOf
 from .pieces import Pieces, PieceSpace
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class PieceMotions(Motions):
         return float(self.problem.energies(displacement)[components].sum())
 
 
-def piece_motions(space: PieceSpace) -> Callable[[StepProblem, Array, tuple[Index, ...]], PieceMotions]:
+def piece_motions(space: PieceSpace) -> MotionsOf:
     """The motions of the pieces of an island, for `coarse.correct`."""
     return lambda problem, displacement, bodies: PieceMotions(problem, displacement, bodies, space)
 
