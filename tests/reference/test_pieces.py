@@ -11,12 +11,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-from cases import Case, box
+from cases import Case, box, rotation
 from mixed_scenes import CASES
 from multilevel_cases import Tables, swing
 from numpy.typing import NDArray
 from programs import ROOT
 from runs import simulator
+from scipy.linalg import eigh
 from scipy.sparse import kron
 from stretch_cases import small_body
 
@@ -110,13 +111,25 @@ def test_pieces_of_a_stiff_beam_save_half_of_the_iterations() -> None:
     assert np.all(np.array(counts(beam, 40, None)) >= [14, 20, 30])
 
 
-def test_the_preconditioner_is_positive() -> None:
-    """1.8 M + Z (Hc^-1 - Ac^-1) Z^T, where a cycle is only about A^-1, on a beam in motion."""
-    case = swing(2, 1e6)
+@pytest.mark.parametrize("poisson", [0.0, 0.45])
+def test_the_preconditioner_is_positive(poisson: float) -> None:
+    """1.8 M + Z (Hc^-1 - Ac^-1) Z^T on a beam in motion.
+
+    H <= A (2 mu + 3 lambda) / (2 mu + lambda), so that for nu = 0 it adds to M, and takes at most 2 / 3 of Ac^-1 else.
+    """
+    mesh = pd.TetMesh(*box((1.0, 0.2, 0.2), (10, 2, 2)))
+    body = pd.Solid(mesh, 1e6, poisson=poisson)
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    case = replace(swing(2, 1e6), scene=scene)
     problem = case.problem()
     tables = Tables(simulator(case, torch.float64, solver=pd.Multilevel("lbfgs")).plan)
-    parts = PieceCycle(problem, tables, cut(problem, 12))
-    parts.observe(3, problem.time_step * problem.velocities)
+    parts = PieceCycle(problem, tables, cut(problem, 6))
+    parts.observe(2, problem.time_step * problem.velocities)
+    space = PieceSpace(problem, parts.pieces, problem.time_step * problem.velocities)
+    ratios = eigh(space.hessian, space.matrix, eigvals_only=True)
+    assert ratios[0] < 0.05  # A is too stiff
+    bulk = poisson / (1.0 - 2.0 * poisson)  # lambda / 2 mu
+    assert ratios[-1] <= (1.0 + 3.0 * bulk) / (1.0 + bulk) * (1.0 + 1e-12)
     free = np.flatnonzero(np.repeat(problem.free, 3))
     rows = np.array([parts(unit.reshape(-1, 3)).ravel()[free] for unit in np.eye(problem.positions.size)[free]])
     assert np.abs(rows - rows.T).max() <= 1e-12 * np.abs(rows).max()
@@ -142,15 +155,15 @@ def test_matrices_of_every_kind_are_those_of_the_step(name: str) -> None:
     assert np.linalg.eigvalsh(space.hessian)[0] > 0.0
 
 
-@pytest.mark.parametrize(("points", "rank"), [(1, 3), (2, 5), (3, 6)])
-def test_pieces_have_the_rigid_motions_that_their_vertices_show(points: int, rank: int) -> None:
+@pytest.mark.parametrize(("own", "rank"), [([23], 3), ([22, 23], 5), ([11, 17, 23], 5), ([20, 21, 23], 6)])
+def test_pieces_have_the_rigid_motions_that_their_vertices_show(own: list[int], rank: int) -> None:
     """A point has three, points in a line five; pinned vertices have none."""
     mesh = pd.shapes.box((0.3, 0.2, 0.1), (3, 2, 1))
-    body = pd.Solid(mesh, 1e6)
-    x = mesh.vertices
-    held = np.flatnonzero(x[:, 0] == 0.0)
+    held = np.flatnonzero(mesh.vertices[:, 0] == 0.0)
+    # so that rounding hides the rank
+    body = pd.Solid(pd.TetMesh(mesh.vertices @ rotation(20.0, 30.0, 40.0).T, mesh.tets), 1e6)
+    x = body.mesh.vertices
     problem = step_problem(pd.Scene(body, pd.Pin(body, held)).values(), x, 0.0 * x, H)
-    own = {1: [23], 2: [22, 23], 3: [20, 21, 23]}[points]
     of = np.where(problem.free, 0, -1)
     of[own] = 1
     space = PieceSpace(problem, Pieces(of, 2), np.zeros_like(x))
@@ -192,6 +205,34 @@ def test_a_bar_that_falls_over_its_corner_bends_right(scenes: ModuleType) -> Non
     assert scenes.error(course, run, exact) <= 0.005
     run = course.run(lambda problem: coarse_chebyshev(problem, iterations=32, every=4))
     assert scenes.error(course, run, exact) > 0.05
+
+
+def test_a_bar_of_stiff_slabs_falls_over_its_corner(scenes: ModuleType) -> None:
+    """1e5 and 1e8 Pa in turn, on smooth ground."""
+    mesh = scenes.box((0.1, 0.5, 0.1), (2, 10, 2))
+    cell = np.floor(20.0 * (0.25 + mesh.vertices[mesh.tets].mean(axis=1)[:, 1])).astype(np.int64)
+    youngs = np.where(cell // 2 % 2 == 1, 1e8, 1e5)
+    bar = scenes.box((0.1, 0.5, 0.1), (2, 10, 2), 15.0, 10.0)
+    course = scenes.course(bar, youngs, scenes.ground(0.0), steps=4)
+    exact = course.converged()
+    pieces = cut(course.problem(0, course.positions, course.velocities), 12)
+    run = course.run(lambda problem: coarse_chebyshev(problem, iterations=16, every=4, pieces=pieces))
+    assert scenes.error(course, run, exact) <= 0.001
+    run = course.run(lambda problem: coarse_chebyshev(problem, iterations=16, every=4))
+    assert scenes.error(course, run, exact) > 0.03
+
+
+def test_the_space_follows_slabs_that_turn() -> None:
+    """Chebyshev with corrections every four iterations: 41, 49 and 69 if the space is made anew, for never."""
+    problem, first, solution, _ = solved(slabs)
+    for remake, most in ((4, 75), (0, 76)):
+        errors: list[float] = []
+        coarse_chebyshev(
+            problem, first, iterations=75, every=4, pieces=cut(problem, most=20), remake=remake,
+            observe=lambda k, u, kept=errors: kept.append(relative_error(u, solution, first)),
+        )  # fmt: skip
+        assert next((k + 1 for k, e in enumerate(errors) if e <= 1e-3), 76) <= most
+    assert errors[-1] > 0.1
 
 
 def test_a_cube_dropped_on_a_cube_deforms_right(pairs: ModuleType) -> None:

@@ -70,6 +70,7 @@ def coarse_chebyshev(
     iterations: int,
     every: int = 0,
     pieces: Pieces | None = None,
+    remake: int = 0,
     relaxation: float = 1.9,
     observe: Callable[[int, Array], None] | None = None,
 ) -> Array:
@@ -77,19 +78,22 @@ def coarse_chebyshev(
 
     A correction precedes and follows the iterations. With `every` another comes after each so many iterations; it
     shifts both iterates alike, so that momentum goes on. With `pieces` these move the pieces, and the first comes at
-    once, where their space is made. `observe(k, u_k)` is called with every iterate.
+    once. Their space is made there, and with `remake` anew after each so many iterations. `observe(k, u_k)` is called
+    with every iterate.
     """
     current = first_iterate(problem) if first is None else first
     radius = min(0.99999, 1.0 - relaxation * problem.smallest_ratio)
     schedule = Guarded(radius, guard_tolerance(problem))
     previous, scale, coming = current, problem.weighted_diagonal[:, None], schedule.omega(0)
-    moves = RigidMotions if pieces is None else piece_motions(PieceSpace(problem, pieces, current))
+    moves: MotionsOf = RigidMotions
     for k in range(iterations):
         energy, gradient = problem.evaluate(current)
         omega, coming = coming, schedule.omega(k + 1)
         if k % 4 == 0:
             schedule.check(energy)
         if every and (k or pieces is not None) and k % every == 0 and iterations - k > 2:
+            if pieces is not None and (not k or (remake and k % remake == 0)):
+                moves = piece_motions(PieceSpace(problem, pieces, current))
             shifted = corrected(problem, current, gradient, moves)
             previous, current = previous + shifted - current, shifted
             gradient = problem.gradient(current)
