@@ -238,8 +238,7 @@ def test_the_space_follows_slabs_that_turn() -> None:
 def test_a_cube_dropped_on_a_cube_deforms_right(pairs: ModuleType) -> None:
     """Rigid motions alone leave the compression of both."""
     bodies = replace(pairs.scenes(1e5, 2)["dropped on a cube"], steps=2)
-    values = pd.Scene(*(pd.Solid(mesh, 1e5) for mesh in bodies.meshes)).values()
-    pieces = cut(step_problem(values, values.rest_positions, bodies.velocities, H), 6)
+    pieces = bodies.cut(6)
     exact = bodies.run(300, every=4, pieces=pieces)
     assert bodies.error(bodies.run(16, every=4, pieces=pieces), exact) <= 0.01
     assert bodies.error(bodies.run(16, every=4), exact) > 0.02
