@@ -46,7 +46,7 @@ def cut(problem: StepProblem, size: int = 25, most: int = MOST) -> Pieces:
     """Cut every component into pieces of about `size` vertices, and at most `most` pieces.
 
     Lloyd's method, with distances along the couplings of A; weak couplings are long, so that pieces follow the
-    stiffness. What no coupling joins is not in one piece.
+    stiffness. Where pins part a component every part has a piece at least.
     """
     of, count = np.full(len(problem.positions), -1), 0
     component = problem.values.component
