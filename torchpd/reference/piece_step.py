@@ -34,7 +34,7 @@ class PieceMotions(Motions):
     @cached_property
     def columns(self) -> Index:
         """[N] the unknowns of the island among those of the space."""
-        return np.flatnonzero(np.isin(self.space.kept // 6, self.space.pieces.of[self.vertices]))
+        return np.flatnonzero(np.isin(self.space.piece, self.space.pieces.of[self.vertices]))
 
     @cached_property
     def modes(self) -> Array:

@@ -1,8 +1,9 @@
 """Pieces of bodies as a coarse space: compact groups of vertices, their rigid motions, and matrices reduced to these.
 
-Z holds the twists of every piece to first order, orthonormal in the piece, without those that its vertices cannot show.
-A matrix of elements is reduced by one pass over the elements of every kind. With B_a = Z_a (x) g_a of the corners
-a, an element of second derivative K adds B_a^T K B_b to the block of the pieces of a and b.
+A vertex moves by the twists of the pieces around it, with weights that add up to one, so that pieces bend into each
+other. Z holds these motions to first order, orthonormal in the piece, without those that its vertices cannot show.
+A matrix of elements is reduced by one pass over the elements of every kind. With B = (g (x) 1) Z of its corners, an
+element of second derivative K adds B^T K B.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import bsr_array, coo_array, csr_array, diags_array, kron
 from scipy.sparse.csgraph import dijkstra
 
 from .geometry import twists
@@ -30,6 +31,8 @@ Index = NDArray[np.int64]
 
 MOST = 64  # pieces of a component
 SWEEPS = 6  # of Lloyd's method
+BLEND = 2  # sweeps that blend the weights of pieces
+DAMPING = 2.0 / 3.0  # of these Jacobi sweeps
 WEAKEST = 0.01  # relative strength of a coupling: an edge is at most 100 times its distance long
 RANK = 1e-6  # relative singular value below which the vertices of a piece do not show a twist
 
@@ -39,14 +42,19 @@ class Pieces:
     """The vertices without hard pins in groups, none of which reaches over two components."""
 
     of: Index  # [V] number of the piece, -1 at hard pins
-    count: int
+    weights: csr_array  # [V, P] share of a piece in the motion of a vertex; rows add up to one, zero at hard pins
+
+    @property
+    def count(self) -> int:
+        return int(self.weights.shape[1])
 
 
-def cut(problem: StepProblem, size: int = 25, most: int = MOST) -> Pieces:
+def cut(problem: StepProblem, size: int = 25, most: int = MOST, blend: int = BLEND) -> Pieces:
     """Cut every component into pieces of about `size` vertices, and at most `most` pieces.
 
     Lloyd's method, with distances along the couplings of A; weak couplings are long, so that pieces follow the
-    stiffness. Where pins part a component every part has a piece at least.
+    stiffness. Where pins part a component every part has a piece at least. `blend` Jacobi sweeps on the elastic part of
+    A smooth the weights of the pieces.
     """
     of, count = np.full(len(problem.positions), -1), 0
     component = problem.values.component
@@ -57,7 +65,21 @@ def cut(problem: StepProblem, size: int = 25, most: int = MOST) -> Pieces:
             label = _lloyd(_lengths(problem, own), wanted)
             of[own] = count + label
             count += int(label.max()) + 1
-    return Pieces(of, count)
+    return Pieces(of, _blended(problem, of, count, blend))
+
+
+def _blended(problem: StepProblem, of: Index, count: int, sweeps: int) -> csr_array:
+    """Weights [V, P] of pieces: one in each, then smoothed and scaled to add up to one."""
+    free = np.flatnonzero(problem.free)
+    weights = csr_array((np.ones(len(free)), (free, of[free])), shape=(len(of), count))
+    elastic = csr_array(problem.matrix - diags_array(problem.weight))
+    diagonal = elastic.diagonal()
+    inverse = np.where(problem.free & (diagonal > 0.0), DAMPING / np.where(diagonal > 0.0, diagonal, 1.0), 0.0)
+    for _ in range(sweeps):
+        weights = csr_array(weights - diags_array(inverse) @ (elastic @ weights)).maximum(0.0)
+        sums = np.asarray(weights.sum(axis=1)).reshape(-1)
+        weights = csr_array(diags_array(1.0 / np.where(sums > 0.0, sums, 1.0)) @ weights)
+    return weights
 
 
 def _lengths(problem: StepProblem, own: Index) -> csr_array:
@@ -122,35 +144,34 @@ class PieceSpace:
     displacement: Array  # [V, 3] m, where it was made
 
     @cached_property
-    def modes(self) -> Array:
-        """[V, 3, 6]: the modes of its piece at every vertex, orthonormal; columns beyond its rank are zero."""
-        modes, y = np.zeros((len(self.displacement), 3, 6)), self.problem.positions + self.displacement
+    def _modes(self) -> tuple[csr_array, Index]:
+        y, weights = self.problem.positions + self.displacement, csr_array(self.pieces.weights.T)
+        rows, columns, entries, of = [], [], [], list[int]()
         for piece in range(self.pieces.count):
-            own = np.flatnonzero(self.pieces.of == piece)
-            arms = y[own] - y[own].mean(axis=0)
+            part = slice(weights.indptr[piece], weights.indptr[piece + 1])
+            own, share = weights.indices[part], weights.data[part, None]
+            arms = y[own] - (share * y[own]).sum(axis=0) / share.sum()
             length = float(np.linalg.norm(arms, axis=1).max())
-            columns = twists(arms / length if length > 0.0 else arms).reshape(-1, 6)
-            basis, values, _ = np.linalg.svd(columns, full_matrices=False)
-            rank = int((values > RANK * values[0]).sum())
-            modes[own, :, :rank] = basis[:, :rank].reshape(-1, 3, rank)
-        return modes
+            motions = share[:, None] * twists(arms / length if length > 0.0 else arms)
+            basis, values, _ = np.linalg.svd(motions.reshape(-1, 6), full_matrices=False)
+            shown = basis[:, values > RANK * values[0]]
+            place = np.meshgrid((3 * own[:, None] + np.arange(3)).reshape(-1), len(of) + np.arange(shown.shape[1]))
+            rows.append(place[0].T.reshape(-1))
+            columns.append(place[1].T.reshape(-1))
+            entries.append(shown.reshape(-1))
+            of += [piece] * shown.shape[1]
+        where = np.concatenate(rows), np.concatenate(columns)
+        return csr_array((np.concatenate(entries), where), shape=(y.size, len(of))), np.array(of)
 
-    @cached_property
-    def kept(self) -> Index:
-        """[N] the columns that are not zero, of 6 a piece."""
-        shown = np.zeros((self.pieces.count, 6), dtype=np.bool_)
-        np.logical_or.at(shown, self.pieces.of[self.problem.free], self.modes[self.problem.free].any(axis=1))
-        return np.flatnonzero(shown)
-
-    @cached_property
+    @property
     def prolongation(self) -> csr_array:
         """Z [3V, N]: it maps motions to displacements."""
-        free = np.flatnonzero(self.problem.free)
-        modes = self.modes[free].reshape(-1, 6)
-        columns = np.repeat(6 * self.pieces.of[free], 3)[:, None] + np.arange(6)
-        rows = np.broadcast_to((3 * free[:, None] + np.arange(3)).reshape(-1, 1), columns.shape)
-        shape = (self.displacement.size, 6 * self.pieces.count)
-        return csr_array(csr_array((modes.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape)[:, self.kept])
+        return self._modes[0]
+
+    @property
+    def piece(self) -> Index:
+        """[N] the piece of every unknown."""
+        return self._modes[1]
 
     def restrict(self, forces: Array) -> Array:
         """Z^T f [N] of forces [V, 3] N."""
@@ -167,7 +188,7 @@ class PieceSpace:
         for group in self.problem.groups:
             F = group.deformation(self.displacement)
             reduced += self._reduced(group, group.law.blocks(F, positive=True), group.law.coupling(F))
-        return self._dense(reduced)
+        return reduced
 
     @cached_property
     def matrix(self) -> Array:
@@ -176,34 +197,22 @@ class PieceSpace:
         for group in self.problem.groups:
             size = 3 * group.stencils.gradients.shape[2]
             reduced += self._reduced(group, (group.law.matrix_weight * group.law.measure)[:, None, None] * np.eye(size))
-        return self._dense(reduced)
-
-    def _dense(self, reduced: Array) -> Array:
-        """[P, P, 6, 6] as [N, N]."""
-        size = 6 * self.pieces.count
-        return np.asarray(np.swapaxes(reduced, 1, 2).reshape(size, size)[np.ix_(self.kept, self.kept)])
-
-    def _inertia(self) -> Array:
-        """Z^T diag(a) Z [P, P, 6, 6]."""
-        reduced = np.zeros((self.pieces.count, self.pieces.count, 6, 6))
-        own = np.einsum("v,vim,vin->vmn", self.problem.weight, self.modes, self.modes)
-        np.add.at(reduced, (self.pieces.of, self.pieces.of), own)  # zero at hard pins
         return reduced
 
+    def _inertia(self) -> Array:
+        """Z^T diag(a) Z [N, N]."""
+        z = self.prolongation
+        return np.asarray((z.T @ (diags_array(np.repeat(self.problem.weight, 3)) @ z)).toarray())
+
     def _reduced(self, group: ElementGroup, blocks: Array, coupling: Coupling | None = None) -> Array:
-        """[P, P, 6, 6] of one kind, from the second derivative [elements, 3 d, 3 d] of each by F^T."""
-        corners, gradients = group.stencils.corners, group.stencils.gradients
-        count, each = corners.shape
-        # modes are zero at hard pins, whose piece is any
-        pieces, number = self.pieces.count, np.maximum(self.pieces.of[corners], 0)
-        changes = np.einsum("eak,eaim->eakim", gradients, self.modes[corners]).reshape(count, each, -1, 6)
-        products = np.einsum("eajm,ejk,ebkn->eabmn", changes, blocks, changes, optimize=True)
-        place = (number[:, :, None] * pieces + number[:, None, :]).reshape(-1)
-        gather = csr_array((np.ones(len(place)), (place, np.arange(len(place)))), shape=(pieces**2, len(place)))
-        reduced = (gather @ products.reshape(-1, 36)).reshape(pieces, pieces, 6, 6)
+        """[N, N] of one kind, from the second derivative [elements, 3 d, 3 d] of each by F^T."""
+        count, size, _ = blocks.shape
+        changes = csr_array(kron(group.operator, np.eye(3)) @ self.prolongation)
+        second = bsr_array((blocks, np.arange(count), np.arange(count + 1)), shape=(size * count, size * count))
+        reduced = changes.T @ (second @ changes)
         if coupling is not None and coupling.factor.any():
-            rows = np.swapaxes(coupling.rows, 1, 2).reshape(count, -1)
-            along = np.zeros((len(coupling.factor), pieces, 6))
-            np.add.at(along, (coupling.group[:, None], number), np.einsum("ej,eajm->eam", rows, changes))
-            reduced = reduced + np.einsum("g,gpm,gqn->pqmn", coupling.factor, along, along, optimize=True)
-        return np.asarray(reduced)
+            entries, columns = np.swapaxes(coupling.rows, 1, 2).reshape(-1), np.arange(size * count)
+            shape = len(coupling.factor), size * count
+            along = csr_array((entries, (np.repeat(coupling.group, size), columns)), shape=shape) @ changes
+            reduced = reduced + along.T @ (diags_array(coupling.factor) @ along)
+        return np.asarray(reduced.toarray())
