@@ -1,9 +1,10 @@
 """Courses of bodies that touch each other: errors after few iterations, with pairs of vertices and faces given.
 
 `python benchmarks/coarse_pairs.py 16 1e5 1e7` prints, for each scene, the error of iterations alone, with corrections
-before and after them, and with further ones after every fourth. It is the greatest over bodies and steps of the error
-of the middle's velocity, or of the spin times half the size, over the greatest speed, at least that of gravity in half
-a step. The pairs of a step are the vertices within `REACH` of a face of another body at its start.
+before and after them, with further ones after every fourth, and with these by pieces of bodies. It is the greatest over
+bodies and steps of the error of the middle's velocity, or of the spin times half the size, over the greatest speed, at
+least that of gravity in half a step. The pairs of a step are the vertices within `REACH` of a face of another body at
+its start.
 """
 
 from __future__ import annotations
@@ -12,13 +13,15 @@ import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
-from coarse_scenes import FALL, H, box, middle_and_spin
+from coarse_scenes import FALL, PIECE, H, box, middle_and_spin
 from numpy.typing import NDArray
 
 import torchpd as pd
 from torchpd.reference import step_problem
 from torchpd.reference.envelopes import PairContacts
 from torchpd.reference.pair_step import pair_chebyshev
+from torchpd.reference.pieces import Pieces, cut
+from torchpd.scene import SceneValues
 
 Array = NDArray[np.float64]
 
@@ -36,10 +39,18 @@ class Bodies:
     parts: tuple[pd.Gravity | pd.Ground, ...]
     steps: int
 
-    def run(self, iterations: int, **options: int | bool) -> list[tuple[Array, Array]]:
+    def values(self) -> SceneValues:
+        return pd.Scene(*(pd.Solid(mesh, self.youngs, density=1000.0) for mesh in self.meshes), *self.parts).values()
+
+    def cut(self, size: int) -> Pieces:
+        """Pieces of about `size` vertices."""
+        values = self.values()
+        return cut(step_problem(values, values.rest_positions, self.velocities, H), size)
+
+    def run(self, iterations: int, **options: int | bool | Pieces) -> list[tuple[Array, Array]]:
         """Positions and velocities after every step; multipliers are carried by vertex and body."""
-        values = pd.Scene(*(pd.Solid(mesh, self.youngs, density=1000.0) for mesh in self.meshes), *self.parts).values()
-        x, v, out, known = np.concatenate([mesh.vertices for mesh in self.meshes]), self.velocities, [], {}
+        values = self.values()
+        x, v, out, known = values.rest_positions, self.velocities, [], {}
         for _ in range(self.steps):
             pairs = self.pairs(x)
             keys = [(int(row[0]), int(values.component[row[1]])) for row in pairs.vertices]
@@ -133,11 +144,11 @@ def scenes(youngs: float, cells: int = 2) -> dict[str, Bodies]:
 
 
 def main(iterations: int, stiffness: list[float]) -> None:
-    print(f"{'scene':20s}{'youngs':>8s}{'alone':>10s}{'both ends':>12s}{'every 4th':>12s}")
+    print(f"{'scene':20s}{'youngs':>8s}{'alone':>10s}{'both ends':>12s}{'every 4th':>12s}{'pieces':>12s}")
     for youngs in stiffness:
         for name, chosen in scenes(youngs).items():
             exact = chosen.run(1000)
-            options = ({"corrections": False}, {}, {"every": 4})
+            options = ({"corrections": False}, {}, {"every": 4}, {"every": 4, "pieces": chosen.cut(PIECE)})
             errors = "".join(f"{chosen.error(chosen.run(iterations, **o), exact):12.1e}" for o in options)
             print(f"{name:20s}{youngs:8.0e}{errors}", flush=True)
 

@@ -1,7 +1,7 @@
 """Scenes of the coarse correction: bodies that fly, land, slide, tip, roll, hang and are gripped.
 
 `python benchmarks/coarse_scenes.py 16 1e5 1e7` prints the errors of a course after 16 iterations a step, with
-corrections before and after them, and with further ones after every fourth.
+corrections before and after them, with further ones after every fourth, and with these by pieces of bodies.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
 from torchpd.reference.coarse_step import coarse_chebyshev
+from torchpd.reference.pieces import cut
 
 Array = NDArray[np.float64]
 Solve = Callable[[StepProblem], Array]
@@ -25,6 +26,7 @@ Solve = Callable[[StepProblem], Array]
 H = 1.0 / 60.0
 CUBE = (0.1, 0.1, 0.1)
 SOLVED = 1e-9  # residual of a converged step
+PIECE = 12  # vertices of a piece
 FALL = 0.5 * 9.8 * H  # m/s: what gravity gives in half a step, the least speed that errors are compared with
 
 
@@ -195,13 +197,18 @@ def scenes(youngs: float, cells: int = 4) -> dict[str, Course]:
 
 
 def main(iterations: int, stiffness: list[float]) -> None:
-    print(f"{'scene':26s}{'youngs':>8s}{'both ends':>12s}{'every 4th':>12s}")
+    print(f"{'scene':26s}{'youngs':>8s}{'both ends':>12s}{'every 4th':>12s}{'pieces':>12s}")
     for youngs in stiffness:
         for name, chosen in scenes(youngs).items():
             exact = chosen.converged()
+            pieces = cut(chosen.problem(0, chosen.positions, chosen.velocities), PIECE)
             runs = [
-                chosen.run(lambda problem, every=every: coarse_chebyshev(problem, iterations=iterations, every=every))
-                for every in (0, 4)
+                chosen.run(
+                    lambda problem, every=every, of=of: coarse_chebyshev(
+                        problem, iterations=iterations, every=every, pieces=of
+                    )
+                )
+                for every, of in ((0, None), (4, None), (4, pieces))
             ]
             errors = "".join(f"{error(chosen, run, exact):12.1e}" for run in runs)
             print(f"{name:26s}{youngs:8.0e}{errors}", flush=True)

@@ -17,6 +17,8 @@ from torchpd.reference import StepProblem, nearest_rotation, step_problem
 from torchpd.reference.coarse import RigidMotions
 from torchpd.reference.coarse_step import coarse_chebyshev, corrected, first_iterate, rigid_fit
 from torchpd.reference.envelopes import contacts_at, pushes_of
+from torchpd.reference.piece_step import piece_motions
+from torchpd.reference.pieces import PieceSpace, cut
 
 Array = NDArray[np.float64]
 H = 1.0 / 60.0
@@ -70,6 +72,9 @@ def test_converged_steps_stay() -> None:
         assert np.abs(corrected(problem, u) - u).max() <= 1e-8
         alone = coarse_chebyshev(problem, corrected(problem, u), iterations=9, every=4)
         assert np.abs(alone - u).max() <= 1e-8
+    for problem, u in solved[::3]:
+        pieces = coarse_chebyshev(problem, u, iterations=9, every=4, pieces=cut(problem, 12))
+        assert np.abs(pieces - u).max() <= 1e-8
 
 
 @pytest.mark.usefixtures("scenes")
@@ -85,8 +90,11 @@ def test_smooth_contacts_never_raise_the_energy() -> None:
             before = state.positions[0].numpy(), state.velocities[0].numpy()
             problem, iterates = step_problem(sim.scene.values(), *before, sim.time_step), []
             coarse_chebyshev(problem, iterations=32, every=4, observe=lambda k, u, kept=iterates: kept.append((k, u)))
+            pieces = piece_motions(PieceSpace(problem, cut(problem, 12), iterates[0][1]))
             for u in (u for k, u in iterates if k % 4 == 0):
-                assert problem.energy(corrected(problem, u)) <= problem.energy(u) * (1.0 + 1e-12)
+                for motions in (RigidMotions, pieces):
+                    energy = problem.energy(corrected(problem, u, motions=motions))
+                    assert energy <= problem.energy(u) * (1.0 + 1e-12)
                 corrections += 1
             with torch.no_grad():
                 state = sim(state)

@@ -1,21 +1,22 @@
-"""Coarse correction of an iterate: the rigid motions of bodies with the least energy, contacts as envelopes.
+"""Coarse correction of an iterate: the motions of bodies with the least energy, contacts as envelopes.
 
 Each body moves by a twist q about its centre, as far as its hard pins leave it free; an island is a body, or bodies
 that pairs join. Elastic energy does not change, so q minimises
 
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
-with a fixed friction radius r. An outer step minimises the quadratic model of Phi by Newton passes, and moves r toward
-friction l in between. It halves the motion until Phi has not risen. The pushes p of the touching vertices follow. At a
-converged step q = 0 and p = 0.
+with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
+An outer step minimises the quadratic model of Phi by Newton passes, and moves r toward friction l in between. It halves
+the motion until Phi has not risen. The pushes p of the touching vertices follow. At a converged step q = 0 and p = 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,16 +24,16 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from .envelopes import Envelopes, PairContacts, contacts_at
+from .geometry import twists
 
 if TYPE_CHECKING:
     from .problem import StepProblem
 
-__all__ = ["RigidMotions", "correct", "islands"]
+__all__ = ["Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-OUTER = 3  # outer steps: turns, gaps and friction radii are taken anew
 PASSES = 12  # Newton passes of an outer step
 SETTLE = 4  # minimisations of an outer step, between which friction radii go half of the way to friction l
 HALVINGS = 8
@@ -41,8 +42,8 @@ EXACT = 1e-12  # rounding: relative change of an energy, and motion over the siz
 
 
 @dataclass(frozen=True)
-class RigidMotions:
-    """Twists (v, w) of the bodies of one island at an iterate: y = c + exp([w]x) (y - c) + v with the centre c.
+class Motions(ABC):
+    """N motions of the bodies of one island at an iterate, and the energy that they change.
 
     All sums run over the vertices of the island alone, so that their bits do not depend on other bodies.
     """
@@ -50,6 +51,8 @@ class RigidMotions:
     problem: StepProblem
     displacement: Array  # [V, 3] m, of the whole scene
     bodies: tuple[Index, ...]  # vertices of every body
+
+    outer: ClassVar[int]  # outer steps, which take turns, gaps and friction radii anew
 
     @cached_property
     def free(self) -> list[Index]:
@@ -60,6 +63,48 @@ class RigidMotions:
     def vertices(self) -> Index:
         """[n] vertices without hard pins of the island."""
         return np.concatenate(self.free)
+
+    @cached_property
+    def size(self) -> float:
+        """Extent of the largest body [m]."""
+        return max(float(np.ptp(self.problem.positions[body], axis=0).max()) for body in self.bodies)
+
+    @property
+    @abstractmethod
+    def modes(self) -> Array:
+        """Z [n, 3, N]: displacements by the motions to first order."""
+
+    @property
+    @abstractmethod
+    def gradient(self) -> Array:
+        """Derivative [N] of the energy by the motions."""
+
+    @property
+    @abstractmethod
+    def hessian(self) -> Array:
+        """Second derivative [N, N] by the motions, positive definite."""
+
+    @abstractmethod
+    def moved(self, motion: Array) -> Array:
+        """Displacement [V, 3] m after motions [N]; hard pins stay."""
+
+    @abstractmethod
+    def energy(self, displacement: Array) -> float:
+        """The energy [J] of the island."""
+
+    def jacobian(self, contacts: Envelopes) -> Array:
+        """Derivative [m, 3, N] of the relative displacements of contacts by the motions."""
+        place = np.full(len(self.displacement), -1)  # the row of zeros, for hard pins
+        place[self.vertices] = np.arange(len(self.vertices))
+        modes = np.concatenate([self.modes, np.zeros((1, *self.modes.shape[1:]))])
+        return np.asarray(np.einsum("mw,mwin->min", contacts.weights, modes[place[contacts.vertices]]))
+
+
+@dataclass(frozen=True)
+class RigidMotions(Motions):
+    """Twists (v, w) of the bodies: y = c + exp([w]x) (y - c) + v with the centre c, and sum a / 2 |u - s|^2."""
+
+    outer = 3
 
     @cached_property
     def bases(self) -> list[tuple[Array, Array]]:
@@ -74,7 +119,7 @@ class RigidMotions:
         # about the mean of the pins: what they leave free are turns alone
         centre = y[~free].mean(axis=0)
         lengths = np.repeat([1.0, float(np.linalg.norm(y - centre, axis=1).max())], 3)
-        pinned = _twists(y[~free] - centre).reshape(-1, 6) / lengths
+        pinned = twists(y[~free] - centre).reshape(-1, 6) / lengths
         values, vectors = np.linalg.eigh(pinned.T @ pinned / int((~free).sum()))
         return centre, vectors[:, values < HELD] / lengths[:, None]
 
@@ -90,16 +135,11 @@ class RigidMotions:
         return out
 
     @cached_property
-    def size(self) -> float:
-        """Extent of the largest body [m]."""
-        return max(float(np.ptp(self.problem.positions[body], axis=0).max()) for body in self.bodies)
-
-    @cached_property
     def modes(self) -> Array:
         """Z [n, 3, N]: displacements by the twists to first order."""
         modes = np.zeros((len(self.vertices), 3, sum(basis.shape[1] for _, basis in self.bases)))
         for _, arms, basis, rows, columns in self.parts:
-            modes[rows, :, columns] = _twists(arms) @ basis
+            modes[rows, :, columns] = twists(arms) @ basis
         return modes
 
     @cached_property
@@ -123,18 +163,11 @@ class RigidMotions:
                 hessian[columns, columns] = exact
         return np.asarray(hessian)
 
-    def jacobian(self, contacts: Envelopes) -> Array:
-        """Derivative [m, 3, N] of the relative displacements of contacts by the twists."""
-        place = np.full(len(self.displacement), -1)  # the row of zeros, for hard pins
-        place[self.vertices] = np.arange(len(self.vertices))
-        modes = np.concatenate([self.modes, np.zeros((1, *self.modes.shape[1:]))])
-        return np.asarray(np.einsum("mw,mwin->min", contacts.weights, modes[place[contacts.vertices]]))
-
-    def moved(self, twists: Array) -> Array:
+    def moved(self, motion: Array) -> Array:
         """Displacement [V, 3] m after finite motions along the twists [N]; hard pins stay."""
         displacement = self.displacement.copy()
         for own, arms, basis, _, columns in self.parts:
-            displacement[own] += _finite(basis @ twists[columns], arms)
+            displacement[own] += _finite(basis @ motion[columns], arms)
         return displacement
 
     def energy(self, displacement: Array) -> float:
@@ -143,8 +176,17 @@ class RigidMotions:
         return 0.5 * float(self.problem.weight[self.vertices] @ (left**2).sum(axis=1))
 
 
+# makes the motions of an island from the problem, the displacement and the vertices of its bodies
+MotionsOf = Callable[["StepProblem", Array, tuple[Index, ...]], Motions]
+
+
 def correct(
-    problem: StepProblem, displacement: Array, forces: Array, pairs: PairContacts | None = None
+    problem: StepProblem,
+    displacement: Array,
+    forces: Array,
+    pairs: PairContacts | None = None,
+    *,
+    motions: MotionsOf = RigidMotions,
 ) -> tuple[Array, Array]:
     """The coarse correction of every island: displacement [V, 3] m, and forces [m, 3] N of the pairs after it.
 
@@ -153,11 +195,12 @@ def correct(
         displacement: [V, 3] m; hard pins at their targets.
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
+        motions: makes the motions of an island.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
     for bodies, of in islands(problem, pairs):
         own = None if pairs is None or not len(of) else pairs.chosen(of)
-        corrected, each = _correct_island(RigidMotions(problem, corrected, bodies), forces, own)
+        corrected, each = _correct_island(motions(problem, corrected, bodies), forces, own)
         after[of] = each[len(each) - len(of) :]
     return corrected, after
 
@@ -175,98 +218,90 @@ def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(rigid: RigidMotions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array]:
+def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array]:
     """Displacement [V, 3] m and forces [m, 3] N of all contacts after the correction."""
-    problem, vertices = rigid.problem, np.concatenate(rigid.bodies)
-    contacts = contacts_at(problem, rigid.displacement, forces, vertices, pairs)
+    problem, vertices = motions.problem, np.concatenate(motions.bodies)
+    contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
-    for _ in range(OUTER):
-        if not rigid.modes.shape[2]:
+    for _ in range(motions.outer):
+        if not motions.modes.shape[2]:
             break
-        jacobian = rigid.jacobian(contacts)
-        twists, radius = _settled(rigid, contacts, jacobian, radius)
-        energy = rigid.energy(rigid.displacement) + contacts.energy(radius)
+        jacobian = motions.jacobian(contacts)
+        motion, radius = _settled(motions, contacts, jacobian, radius)
+        energy = motions.energy(motions.displacement) + contacts.energy(radius)
         for _ in range(HALVINGS):
-            moved = rigid.moved(twists)
+            moved = motions.moved(motion)
             after = contacts_at(problem, moved, forces, vertices, pairs)
-            way = (contacts.weights[:, :, None] * (moved - rigid.displacement)[contacts.vertices]).sum(axis=1)
+            way = (contacts.weights[:, :, None] * (moved - motions.displacement)[contacts.vertices]).sum(axis=1)
             trial = replace(contacts.shifted(way), gaps=after.gaps)
-            if rigid.energy(moved) + trial.energy(radius) <= energy * (1.0 + EXACT):
+            if motions.energy(moved) + trial.energy(radius) <= energy * (1.0 + EXACT):
                 break
-            twists = 0.5 * twists
+            motion = 0.5 * motion
         else:
             break
-        still, rigid, contacts = rigid, replace(rigid, displacement=moved), after
+        still, motions, contacts = motions, replace(motions, displacement=moved), after
         radius = contacts.friction * trial.normal_forces()
-        if np.abs(moved - still.displacement).max() < EXACT * rigid.size:
+        if np.abs(moved - still.displacement).max() < EXACT * motions.size:
             break
-    return _pushed(rigid, contacts, radius), contacts.forces(radius)
+    return _pushed(motions, contacts, radius), contacts.forces(radius)
 
 
-def _settled(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, radius: Array) -> tuple[Array, Array]:
-    """Twists [N] of the quadratic model, and friction radii [m] N near those of the normal forces that they leave.
+def _settled(motions: Motions, contacts: Envelopes, jacobian: Array, radius: Array) -> tuple[Array, Array]:
+    """Motions [N] of the quadratic model, and friction radii [m] N near those of the normal forces that they leave.
 
     Radii that follow the normal forces at once oscillate where a stiff body lands on rough ground; half of the way
     settles. Each radius waits for the minimum: an unfinished one leads to other contact forces in a rough corner. The
-    twists minimise the model for the radii returned, which the guard needs.
+    motions minimise the model for the radii returned, which the guard needs.
     """
-    twists = np.zeros(len(rigid.gradient))
+    motion = np.zeros(len(motions.gradient))
     for _ in range(SETTLE - 1):
-        twists = _newton_passes(rigid, contacts, jacobian, radius, twists)
-        lag = contacts.friction * contacts.shifted(jacobian @ twists).normal_forces() - radius
+        motion = _newton_passes(motions, contacts, jacobian, radius, motion)
+        lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
         if np.linalg.norm(lag) <= EXACT * np.linalg.norm(radius):
-            return twists, radius
+            return motion, radius
         radius = radius + 0.5 * lag
-    return _newton_passes(rigid, contacts, jacobian, radius, twists), radius
+    return _newton_passes(motions, contacts, jacobian, radius, motion), radius
 
 
-def _newton_passes(rigid: RigidMotions, contacts: Envelopes, jacobian: Array, radius: Array, twists: Array) -> Array:
-    """Twists [N] of least quadratic model of Phi for fixed friction radii [m] N, from given ones."""
-    gradient, hessian = rigid.gradient, rigid.hessian
+def _newton_passes(motions: Motions, contacts: Envelopes, jacobian: Array, radius: Array, motion: Array) -> Array:
+    """Motions [N] of least quadratic model of Phi for fixed friction radii [m] N, from given ones."""
+    gradient, hessian = motions.gradient, motions.hessian
 
-    def model(twists: Array, moved: Envelopes) -> float:
-        return moved.energy(radius) + float((gradient + 0.5 * hessian @ twists) @ twists)
+    def model(motion: Array, moved: Envelopes) -> float:
+        return moved.energy(radius) + float((gradient + 0.5 * hessian @ motion) @ motion)
 
-    trial = contacts.shifted(jacobian @ twists)
-    energy = model(twists, trial)
+    trial = contacts.shifted(jacobian @ motion)
+    energy = model(motion, trial)
     for _ in range(PASSES):
         forces, second = trial.forces(radius), trial.second_derivatives(radius)
         on = second.any(axis=(1, 2))
         matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-        step = np.linalg.solve(matrix, np.einsum("min,mi->n", jacobian, forces) - gradient - hessian @ twists)
+        step = np.linalg.solve(matrix, np.einsum("min,mi->n", jacobian, forces) - gradient - hessian @ motion)
         for _ in range(HALVINGS):
-            moved = contacts.shifted(jacobian @ (twists + step))
-            reached = model(twists + step, moved)
+            moved = contacts.shifted(jacobian @ (motion + step))
+            reached = model(motion + step, moved)
             if reached <= energy + EXACT * abs(energy):
                 break
             step = 0.5 * step
         else:
             break
-        twists, trial, energy = twists + step, moved, reached
-        if np.abs(rigid.modes @ step).max() < EXACT * rigid.size:
+        motion, trial, energy = motion + step, moved, reached
+        if np.abs(motions.modes @ step).max() < EXACT * motions.size:
             break
-    return twists
+    return motion
 
 
-def _pushed(rigid: RigidMotions, contacts: Envelopes, radius: Array) -> Array:
+def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
     """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island."""
-    problem = rigid.problem
+    problem = motions.problem
     before = contacts.normal_anchors[:, None] * contacts.normals + contacts.tangent_anchors
     each = contacts.weights[:, :, None] * (contacts.forces(radius) - before)[:, None, :]
-    forces = np.zeros_like(rigid.displacement)
+    forces = np.zeros_like(motions.displacement)
     np.add.at(forces, contacts.vertices.reshape(-1), each.reshape(-1, 3))
-    pushed = rigid.displacement + np.where(problem.free[:, None], forces / problem.weighted_diagonal[:, None], 0.0)
-    moved, own = rigid.displacement.copy(), np.concatenate(rigid.bodies)
+    pushed = motions.displacement + np.where(problem.free[:, None], forces / problem.weighted_diagonal[:, None], 0.0)
+    moved, own = motions.displacement.copy(), np.concatenate(motions.bodies)
     moved[own] = problem.project(pushed)[own]
     return moved
-
-
-def _twists(arms: Array) -> Array:
-    """[1, -[r]x] [n, 3, 6]: the displacement of points at arms r [n, 3] by a twist (v, w) is v + w x r."""
-    modes = np.zeros((len(arms), 3, 6))
-    modes[:, :, :3] = np.eye(3)
-    modes[:, :, 3:] = -_cross(arms)
-    return modes
 
 
 def _cross(vectors: Array) -> Array:

@@ -9,23 +9,30 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse import EXACT, PASSES, RigidMotions, correct, islands
+from .coarse import EXACT, PASSES, MotionsOf, RigidMotions, correct, islands
 from .envelopes import pushes_of
+from .piece_step import piece_motions
+from .pieces import Pieces, PieceSpace
 from .schedules import Guarded
 from .solvers import guard_tolerance
 
 if TYPE_CHECKING:
     from .problem import StepProblem
 
-__all__ = ["coarse_chebyshev", "corrected", "energies", "first_iterate", "rigid_fit"]
+__all__ = ["coarse_chebyshev", "corrected", "first_iterate", "rigid_fit"]
 
 Array = NDArray[np.float64]
 
 
-def corrected(problem: StepProblem, displacement: Array, gradient: Array | None = None) -> Array:
+def corrected(
+    problem: StepProblem,
+    displacement: Array,
+    gradient: Array | None = None,
+    motions: MotionsOf = RigidMotions,
+) -> Array:
     """Displacement [V, 3] m after a coarse correction, from the forces of the contacts at the iterate."""
     gradient = problem.gradient(displacement) if gradient is None else gradient
-    return correct(problem, displacement, pushes_of(problem, displacement, gradient))[0]
+    return correct(problem, displacement, pushes_of(problem, displacement, gradient), motions=motions)[0]
 
 
 def first_iterate(problem: StepProblem) -> Array:
@@ -39,7 +46,7 @@ def first_iterate(problem: StepProblem) -> Array:
     guess = problem.hold(problem.time_step * problem.velocities)
     kept = correct(problem, rigid_fit(problem, still, guess), forces)[0]
     moved = corrected(problem, problem.project(guess))
-    lower, component = energies(problem, moved) < energies(problem, kept), problem.values.component
+    lower, component = problem.energies(moved) < problem.energies(kept), problem.values.component
     return np.where(lower[component, None], moved, kept)
 
 
@@ -56,43 +63,38 @@ def rigid_fit(problem: StepProblem, displacement: Array, goal: Array) -> Array:
     return displacement
 
 
-def energies(problem: StepProblem, displacement: Array) -> Array:
-    """E(u) [J] of every component."""
-    component, count = problem.values.component, int(problem.values.component.max()) + 1
-    pull = np.where(problem.free[:, None], displacement - problem.target, 0.0)
-    inertia = 0.5 * problem.weight * (pull**2).sum(axis=1)
-    energy = np.asarray(np.bincount(component, inertia, count), np.float64)
-    for group in problem.groups:
-        each = group.law.evaluate(group.deformation(displacement))[0]
-        energy = energy + np.bincount(component[group.stencils.corners[:, 0]], each, count)
-    return np.asarray(energy, np.float64)
-
-
 def coarse_chebyshev(
     problem: StepProblem,
     first: Array | None = None,
     *,
     iterations: int,
     every: int = 0,
+    pieces: Pieces | None = None,
+    remake: int = 0,
     relaxation: float = 1.9,
     observe: Callable[[int, Array], None] | None = None,
 ) -> Array:
     """Displacement [V, 3] m after guarded Chebyshev iterations and coarse corrections.
 
     A correction precedes and follows the iterations. With `every` another comes after each so many iterations; it
-    shifts both iterates alike, so that momentum goes on. `observe(k, u_k)` is called with every iterate.
+    shifts both iterates alike, so that momentum goes on. With `pieces` these move the pieces, and the first comes at
+    once. Their space is made there, and with `remake` anew after each so many iterations. `observe(k, u_k)` is called
+    with every iterate.
     """
     current = first_iterate(problem) if first is None else first
     radius = min(0.99999, 1.0 - relaxation * problem.smallest_ratio)
     schedule = Guarded(radius, guard_tolerance(problem))
     previous, scale, coming = current, problem.weighted_diagonal[:, None], schedule.omega(0)
+    moves: MotionsOf = RigidMotions
     for k in range(iterations):
         energy, gradient = problem.evaluate(current)
         omega, coming = coming, schedule.omega(k + 1)
         if k % 4 == 0:
             schedule.check(energy)
-        if every and k and k % every == 0 and iterations - k > 2:
-            shifted = corrected(problem, current, gradient)
+        if every and (k or pieces is not None) and k % every == 0 and iterations - k > 2:
+            if pieces is not None and (not k or (remake and k % remake == 0)):
+                moves = piece_motions(PieceSpace(problem, pieces, current))
+            shifted = corrected(problem, current, gradient, moves)
             previous, current = previous + shifted - current, shifted
             gradient = problem.gradient(current)
         step = current - relaxation * gradient / scale

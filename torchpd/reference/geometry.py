@@ -1,4 +1,4 @@
-"""Shape gradients of elements, the bound of their majoriser, the sparse operator of deformation gradients; normals."""
+"""Shape gradients of elements, the bound of their majoriser, the operator of deformation gradients; normals; twists."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-__all__ = ["Elements", "elements", "gradient_operator", "sphere_normals", "spreads"]
+__all__ = ["Elements", "elements", "gradient_operator", "sphere_normals", "spreads", "twists"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -57,3 +57,12 @@ def sphere_normals(positions: Array, center: Array) -> tuple[Array, Array]:
     arms = positions - center
     lengths = np.linalg.norm(arms, axis=1, keepdims=True)
     return np.where(lengths > 0.0, arms / np.maximum(lengths, 1e-300), [0.0, 1.0, 0.0]), lengths[:, 0]
+
+
+def twists(arms: Array) -> Array:
+    """[1, -[r]x] [n, 3, 6]: the displacement of points at arms r [n, 3] by a twist (v, w) is v + w x r."""
+    modes = np.zeros((len(arms), 3, 6))
+    modes[:, :, :3] = np.eye(3)
+    for k in range(3):
+        modes[:, :, 3 + k] = np.cross(np.eye(3)[k], arms)
+    return modes

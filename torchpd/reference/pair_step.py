@@ -17,9 +17,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse import correct
+from .coarse import MotionsOf, RigidMotions, correct
 from .coarse_step import rigid_fit
 from .envelopes import Envelopes, PairContacts, contacts_at, pushes_of
+from .piece_step import piece_motions
+from .pieces import Pieces, PieceSpace
 from .schedules import Guarded
 
 if TYPE_CHECKING:
@@ -39,11 +41,16 @@ def pair_chebyshev(
     *,
     iterations: int,
     every: int = 0,
+    pieces: Pieces | None = None,
     corrections: bool = True,
     relaxation: float = 1.9,
 ) -> tuple[Array, PairContacts]:
-    """Displacement [V, 3] m after guarded Chebyshev iterations, and the pairs with their forces then."""
+    """Displacement [V, 3] m after guarded Chebyshev iterations, and the pairs with their forces then.
+
+    `every` and `pieces` are those of `coarse_chebyshev`.
+    """
     current, pairs = _first(problem, pairs) if corrections else (problem.unsolved(), pairs)
+    moves = RigidMotions if pieces is None else piece_motions(PieceSpace(problem, pieces, current))
     schedule = Guarded(min(0.99999, 1.0 - relaxation * problem.smallest_ratio), RISE)
     previous, checked = current, current
     scale = problem.weighted_diagonal[:, None]
@@ -55,8 +62,8 @@ def pair_chebyshev(
             schedule.check(guarded_energy(problem, pairs, current))
             checked = current
         omega = schedule.omega(k)
-        if corrections and every and k and k % every == 0 and iterations - k > 2:
-            shifted, pairs = corrected_pairs(problem, pairs, current)
+        if corrections and every and (k or pieces is not None) and k % every == 0 and iterations - k > 2:
+            shifted, pairs = corrected_pairs(problem, pairs, current, moves)
             previous, current = previous + shifted - current, shifted
             gradient = problem.gradient(current)
         following = previous + omega * (current - relaxation * gradient / scale - previous)
@@ -75,11 +82,13 @@ def _first(problem: StepProblem, pairs: PairContacts) -> tuple[Array, PairContac
     return moved, replace(pairs, forces=after)
 
 
-def corrected_pairs(problem: StepProblem, pairs: PairContacts, displacement: Array) -> tuple[Array, PairContacts]:
+def corrected_pairs(
+    problem: StepProblem, pairs: PairContacts, displacement: Array, motions: MotionsOf = RigidMotions
+) -> tuple[Array, PairContacts]:
     """Displacement [V, 3] m and pairs after a coarse correction."""
     # the forces of planes answer the elastic forces and those of the pairs
     gradient = problem.gradient(displacement) - nodal(problem, pairs, pairs.forces)
-    moved, after = correct(problem, displacement, pushes_of(problem, displacement, gradient), pairs)
+    moved, after = correct(problem, displacement, pushes_of(problem, displacement, gradient), pairs, motions=motions)
     return moved, replace(pairs, forces=after)
 
 

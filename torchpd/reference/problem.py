@@ -95,6 +95,16 @@ class StepProblem:
         """E(u) [J]."""
         return self.evaluate(displacement)[0]
 
+    def energies(self, displacement: Array) -> Array:
+        """E(u) [J] of every component."""
+        component, count = self.values.component, int(self.values.component.max()) + 1
+        pull = np.where(self.free[:, None], displacement - self.target, 0.0)
+        energy = np.bincount(component, 0.5 * self.weight * (pull**2).sum(axis=1), count)
+        for group in self.groups:
+            each = group.law.evaluate(group.deformation(displacement))[0]
+            energy = energy + np.bincount(component[group.stencils.corners[:, 0]], each, count)
+        return np.asarray(energy, np.float64)
+
     def gradient(self, displacement: Array) -> Array:
         """grad E(u) [V, 3] in N, zero at hard pins."""
         return self.evaluate(displacement)[1]
