@@ -177,7 +177,7 @@ class Stepper(Readable):
         start: str = "velocity",
         return_info: bool = False,
         progress: bool = False,
-    ) -> Any:
+    ) -> Track:
         """Advance a state by many time steps and record some of them.
 
         A scene with pressure or wind takes step by step, with the forces at the start of each. So does a scene with
@@ -210,7 +210,7 @@ class Stepper(Readable):
         if not _is_start(start):
             raise ValueError(f'rollout: start must be "velocity" or "inertial", got {_in_short(start)}')
         call = Rollout(state, steps, every, forces, targets, start == "inertial", return_info, first)
-        return run_rollout(self, call, progress=progress)
+        return cast(Track, run_rollout(self, call, progress=progress))
 
     def advance(
         self,
