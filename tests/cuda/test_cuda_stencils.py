@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchpd as pd
 from torchpd.common.tables import EFFECT_ROWS, KINDS, MATERIAL_TABLE, ROW_SIZES
+from torchpd.estimate.solver_choice import runs
 from torchpd.ops import INFO_WIDTH
 from torchpd.plan import kernel_choice as regimes
 from torchpd.plan.placement import step_bytes
@@ -322,6 +323,7 @@ def test_what_has_no_stencils_is_refused_by_name(precision: str) -> None:
             simulator(case, dtype, GPU, kernel=kernel)
     with pytest.raises(ValueError, match=r"solver must be Chebyshev\(\) or Jacobi\(\) .*cloth.* got Multilevel"):
         simulator(case, dtype, GPU, solver=pd.Multilevel("lbfgs"))
+    assert not runs(pd.Multilevel("lbfgs"), simulator(case, dtype, GPU).compiled)
     with pytest.raises(ValueError, match=r'adjoint="multilevel" needs a scene of solids alone'):
         simulator(case, dtype, GPU, adjoint="multilevel", kernel="stream")
 
