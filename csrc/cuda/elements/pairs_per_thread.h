@@ -388,10 +388,10 @@ PD_DEVICE void process_pair(const Read& read, const Shape& shape, const PairInpu
   } else if constexpr (OnFaces<Element>) {
     element.run_face(pair.corner[0], shape.face, numbers.weight, pair.force, energy);
   } else {
-    element.template run<1>(
-        PairElement<T, Fields, First>{pair, shape.face.inverse(0), numbers.signed_weight(0), energy});
-    element.template run<1>(
-        PairElement<T, Fields, Second>{pair, shape.face.inverse(1), numbers.signed_weight(1), energy});
+    element.template run<1>(PairElement<T, Fields, First>{pair, shape.face.inverse(0),
+                                                          numbers.signed_weight(0), energy});
+    element.template run<1>(PairElement<T, Fields, Second>{pair, shape.face.inverse(1),
+                                                           numbers.signed_weight(1), energy});
   }
   for (int c = 0; c < 4; ++c) write_entry(pair.force[c], entries[numbers.entry(c)]);
   if (numbers.entry(4) != no_entry) write_entry(pair.force[4], entries[numbers.entry(4)]);
