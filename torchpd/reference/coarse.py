@@ -6,8 +6,9 @@ that pairs join. Elastic energy does not change, so q minimises
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
 with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
-An outer step minimises the quadratic model of Phi by Newton passes, and moves r toward friction l in between. It halves
-the motion until Phi has not risen. The pushes p of the touching vertices follow. At a converged step q = 0 and p = 0.
+An outer step minimises Phi with gaps and slips to first order, which is convex: Newton's steps, each ended by an exact
+search, and r moves toward friction l in between. It halves the motion until Phi has not risen. The pushes p of the
+touching vertices follow, contact by contact. At a converged step q = 0 and p = 0.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +30,18 @@ from .geometry import twists
 if TYPE_CHECKING:
     from .problem import StepProblem
 
-__all__ = ["Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
+__all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-PASSES = 12  # Newton passes of an outer step
-SETTLE = 4  # minimisations of an outer step, between which friction radii go half of the way to friction l
-HALVINGS = 8
+OUTER = 6  # finite motions
+PASSES = 12  # Newton's steps to one of them
+CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-EXACT = 1e-12  # rounding: relative change of an energy, and motion over the size of a body, that count as none
+STILL = 1e-6  # of the size of a body, and of the friction radii: a step that ends the passes
+NEAR = 1e-3  # of the size: a step within which friction radii move half way to friction l
+ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,6 @@ class Motions(ABC):
     displacement: Array  # [V, 3] m, of the whole scene
     bodies: tuple[Index, ...]  # vertices of every body
 
-    outer: ClassVar[int]  # outer steps, which take turns, gaps and friction radii anew
-
     @cached_property
     def free(self) -> list[Index]:
         """Vertices without hard pins of every body."""
@@ -63,11 +64,6 @@ class Motions(ABC):
     def vertices(self) -> Index:
         """[n] vertices without hard pins of the island."""
         return np.concatenate(self.free)
-
-    @cached_property
-    def size(self) -> float:
-        """Extent of the largest body [m]."""
-        return max(float(np.ptp(self.problem.positions[body], axis=0).max()) for body in self.bodies)
 
     @property
     @abstractmethod
@@ -84,12 +80,22 @@ class Motions(ABC):
     def hessian(self) -> Array:
         """Second derivative [N, N] by the motions, positive definite."""
 
+    @property
     @abstractmethod
-    def moved(self, motion: Array) -> Array:
-        """Displacement [V, 3] m after motions [N]; hard pins stay."""
+    def scale(self) -> float:
+        """The energy [J] that moves the island by its size."""
 
     @abstractmethod
-    def energy(self, displacement: Array) -> float:
+    def share(self, motion: Array) -> float:
+        """Motions [N] over the size of the island."""
+
+    @abstractmethod
+    def after(self, motion: Array) -> Self:
+        """The same after motions [N]; hard pins stay."""
+
+    @property
+    @abstractmethod
+    def energy(self) -> float:
         """The energy [J] of the island."""
 
     def jacobian(self, contacts: Envelopes) -> Array:
@@ -103,8 +109,6 @@ class Motions(ABC):
 @dataclass(frozen=True)
 class RigidMotions(Motions):
     """Twists (v, w) of the bodies: y = c + exp([w]x) (y - c) + v with the centre c, and sum a / 2 |u - s|^2."""
-
-    outer = 3
 
     @cached_property
     def bases(self) -> list[tuple[Array, Array]]:
@@ -163,21 +167,45 @@ class RigidMotions(Motions):
                 hessian[columns, columns] = exact
         return np.asarray(hessian)
 
-    def moved(self, motion: Array) -> Array:
-        """Displacement [V, 3] m after finite motions along the twists [N]; hard pins stay."""
+    @property
+    def scale(self) -> float:
+        """Sum of a |arm|^2 [J]."""
+        weight = self.problem.weight
+        return sum(float(weight[own] @ (arms**2).sum(axis=1)) for own, arms, *_ in self.parts)
+
+    def share(self, motion: Array) -> float:
+        """Largest of |v| / l + |w| over the bodies, l^2 the mean of |arm|^2 by a."""
+        shares = [0.0]
+        for own, arms, basis, _, columns in self.parts:
+            weight, twist = self.problem.weight[own], basis @ motion[columns]
+            size = float(np.sqrt(weight @ (arms**2).sum(axis=1) / weight.sum()))
+            shares.append(float(np.linalg.norm(twist[:3])) / size + float(np.linalg.norm(twist[3:])))
+        return max(shares)
+
+    def after(self, motion: Array) -> RigidMotions:
+        """The same after finite motions along the twists [N]; hard pins stay."""
         displacement = self.displacement.copy()
         for own, arms, basis, _, columns in self.parts:
             displacement[own] += _finite(basis @ motion[columns], arms)
-        return displacement
+        return replace(self, displacement=displacement)
 
-    def energy(self, displacement: Array) -> float:
+    @property
+    def energy(self) -> float:
         """sum a / 2 |u - s|^2 [J] of the free vertices of the island."""
-        left = (displacement - self.problem.target)[self.vertices]
+        left = (self.displacement - self.problem.target)[self.vertices]
         return 0.5 * float(self.problem.weight[self.vertices] @ (left**2).sum(axis=1))
 
 
 # makes the motions of an island from the problem, the displacement and the vertices of its bodies
 MotionsOf = Callable[["StepProblem", Array, tuple[Index, ...]], Motions]
+
+
+class Correction(NamedTuple):
+    """What a coarse correction leaves."""
+
+    displacement: Array  # [V, 3] m
+    forces: Array  # [m, 3] N of the pairs
+    energies: Array  # [components] J: Phi of its island, before the pushes; inf where pins leave no motion
 
 
 def correct(
@@ -187,8 +215,8 @@ def correct(
     pairs: PairContacts | None = None,
     *,
     motions: MotionsOf = RigidMotions,
-) -> tuple[Array, Array]:
-    """The coarse correction of every island: displacement [V, 3] m, and forces [m, 3] N of the pairs after it.
+) -> Correction:
+    """The coarse correction of every island.
 
     Args:
         problem: the step.
@@ -198,11 +226,15 @@ def correct(
         motions: makes the motions of an island.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
+    energies = np.full(int(problem.values.component.max()) + 1, np.inf)
     for bodies, of in islands(problem, pairs):
-        own = None if pairs is None or not len(of) else pairs.chosen(of)
-        corrected, each = _correct_island(motions(problem, corrected, bodies), forces, own)
+        own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
+        if not moving.modes.shape[2]:
+            continue
+        corrected, each, energy = _correct_island(moving, forces, own)
         after[of] = each[len(each) - len(of) :]
-    return corrected, after
+        energies[problem.values.component[[body[0] for body in bodies]]] = energy
+    return Correction(corrected, after, energies)
 
 
 def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
@@ -218,88 +250,85 @@ def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array]:
-    """Displacement [V, 3] m and forces [m, 3] N of all contacts after the correction."""
+def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, float]:
+    """Displacement [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
-    for _ in range(motions.outer):
-        if not motions.modes.shape[2]:
-            break
-        jacobian = motions.jacobian(contacts)
-        motion, radius = _settled(motions, contacts, jacobian, radius)
-        energy = motions.energy(motions.displacement) + contacts.energy(radius)
-        for _ in range(HALVINGS):
-            moved = motions.moved(motion)
-            after = contacts_at(problem, moved, forces, vertices, pairs)
-            way = (contacts.weights[:, :, None] * (moved - motions.displacement)[contacts.vertices]).sum(axis=1)
-            trial = replace(contacts.shifted(way), gaps=after.gaps)
-            if motions.energy(moved) + trial.energy(radius) <= energy * (1.0 + EXACT):
+    phi = motions.energy + contacts.energy(radius)
+    for _ in range(OUTER):
+        motion, radius = _model_minimum(motions, contacts, radius)
+        energy = motions.energy + contacts.energy(radius)
+        for _ in range(CUTS + 1):
+            trial = motions.after(motion)
+            after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
+            way = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
+            reached = trial.energy + replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
+            if reached <= energy + ROUNDING * (motions.scale + energy):
                 break
             motion = 0.5 * motion
         else:
             break
-        still, motions, contacts = motions, replace(motions, displacement=moved), after
-        radius = contacts.friction * trial.normal_forces()
-        if np.abs(moved - still.displacement).max() < EXACT * motions.size:
+        share = motions.share(motion)
+        motions, contacts, phi = trial, after, reached
+        if share <= STILL:
             break
-    return _pushed(motions, contacts, radius), contacts.forces(radius)
+    return _pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
-def _settled(motions: Motions, contacts: Envelopes, jacobian: Array, radius: Array) -> tuple[Array, Array]:
-    """Motions [N] of the quadratic model, and friction radii [m] N near those of the normal forces that they leave.
+def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
-    Radii that follow the normal forces at once oscillate where a stiff body lands on rough ground; half of the way
-    settles. Each radius waits for the minimum: an unfinished one leads to other contact forces in a rough corner. The
-    motions minimise the model for the radii returned, which the guard needs.
+    Newton's steps, each ended where the model is least along it. Radii move half way to friction l where a step is near
+    enough to the minimum.
     """
-    motion = np.zeros(len(motions.gradient))
-    for _ in range(SETTLE - 1):
-        motion = _newton_passes(motions, contacts, jacobian, radius, motion)
-        lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
-        if np.linalg.norm(lag) <= EXACT * np.linalg.norm(radius):
-            return motion, radius
-        radius = radius + 0.5 * lag
-    return _newton_passes(motions, contacts, jacobian, radius, motion), radius
+    gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
+    motion = np.zeros(len(gradient))
 
+    def slope(motion: Array, step: Array) -> float:
+        forces = contacts.shifted(jacobian @ motion).forces(radius)
+        return float((gradient + hessian @ motion) @ step - ((jacobian @ step) * forces).sum())
 
-def _newton_passes(motions: Motions, contacts: Envelopes, jacobian: Array, radius: Array, motion: Array) -> Array:
-    """Motions [N] of least quadratic model of Phi for fixed friction radii [m] N, from given ones."""
-    gradient, hessian = motions.gradient, motions.hessian
-
-    def model(motion: Array, moved: Envelopes) -> float:
-        return moved.energy(radius) + float((gradient + 0.5 * hessian @ motion) @ motion)
-
-    trial = contacts.shifted(jacobian @ motion)
-    energy = model(motion, trial)
     for _ in range(PASSES):
-        forces, second = trial.forces(radius), trial.second_derivatives(radius)
+        trial = contacts.shifted(jacobian @ motion)
+        second = trial.second_derivatives(radius)
         on = second.any(axis=(1, 2))
         matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-        step = np.linalg.solve(matrix, np.einsum("min,mi->n", jacobian, forces) - gradient - hessian @ motion)
-        for _ in range(HALVINGS):
-            moved = contacts.shifted(jacobian @ (motion + step))
-            reached = model(motion + step, moved)
-            if reached <= energy + EXACT * abs(energy):
-                break
-            step = 0.5 * step
-        else:
+        force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion
+        # a line has no inertia about itself
+        step = np.linalg.lstsq(matrix, force, rcond=1e-12)[0]
+        low, high = 0.0, 1.0
+        if slope(motion + step, step) > 1e-9 * abs(slope(motion, step)):
+            for _ in range(40):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if slope(motion + middle * step, step) < 0.0 else (low, middle)
+        motion, share = motion + high * step, motions.share(high * step)
+        lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
+        if share <= STILL and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
             break
-        motion, trial, energy = motion + step, moved, reached
-        if np.abs(motions.modes @ step).max() < EXACT * motions.size:
-            break
-    return motion
+        if share <= NEAR:
+            radius = radius + 0.5 * lag
+    return motion, radius
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
-    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island."""
-    problem = motions.problem
-    before = contacts.normal_anchors[:, None] * contacts.normals + contacts.tangent_anchors
-    each = contacts.weights[:, :, None] * (contacts.forces(radius) - before)[:, None, :]
-    forces = np.zeros_like(motions.displacement)
-    np.add.at(forces, contacts.vertices.reshape(-1), each.reshape(-1, 3))
-    pushed = motions.displacement + np.where(problem.free[:, None], forces / problem.weighted_diagonal[:, None], 0.0)
-    moved, own = motions.displacement.copy(), np.concatenate(motions.bodies)
+    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island.
+
+    A vertex that touches several planes and spheres is pushed by one after another.
+    """
+    problem, own = motions.problem, np.concatenate(motions.bodies)
+    several = len(problem.values.planes) + len(problem.values.spheres)
+    rows = np.array_split(np.arange(several * len(motions.vertices)), max(several, 1))
+    pushed = motions.displacement.copy()
+    for of in [*rows, np.arange(several * len(motions.vertices), len(contacts.gaps))]:
+        each = contacts.chosen(of)
+        way = (each.weights[:, :, None] * (pushed - motions.displacement)[each.vertices]).sum(axis=1)
+        before = each.normal_anchors[:, None] * each.normals + each.tangent_anchors
+        push = each.weights[:, :, None] * (each.shifted(way).forces(radius[of]) - before)[:, None, :]
+        forces = np.zeros_like(pushed)
+        np.add.at(forces, each.vertices.reshape(-1), push.reshape(-1, 3))
+        pushed = pushed + np.where(problem.free[:, None], forces / problem.weighted_diagonal[:, None], 0.0)
+    moved = motions.displacement.copy()
     moved[own] = problem.project(pushed)[own]
     return moved
 
@@ -321,8 +350,7 @@ def _curvature(left: Array, arms: Array) -> Array:
 
 
 def _finite(twist: Array, arms: Array) -> Array:
-    """Finite displacement [n, 3] of points at arms [n, 3] by a twist (v, w): (exp [w]x - 1) r + v."""
-    w, angle = _cross(twist[3:]), float(np.linalg.norm(twist[3:]))
-    half = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2  # (1 - cos angle) / angle^2
-    turn = np.sinc(angle / np.pi) * w + half * w @ w
+    """Displacement of arms [n, 3] by a twist (v, w): (R - 1) r + v, R the turn about w by 2 atan(|w| / 2) (Cayley)."""
+    half = _cross(0.5 * twist[3:])
+    turn = 2.0 / (1.0 + 0.25 * float(twist[3:] @ twist[3:])) * (half + half @ half)
     return np.asarray(arms @ turn.T + twist[:3])

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .coarse import EXACT, PASSES, MotionsOf, RigidMotions, correct, islands
+from .coarse import MotionsOf, RigidMotions, correct
 from .envelopes import pushes_of
 from .piece_step import piece_motions
 from .pieces import Pieces, PieceSpace
@@ -19,7 +18,7 @@ from .solvers import guard_tolerance
 if TYPE_CHECKING:
     from .problem import StepProblem
 
-__all__ = ["coarse_chebyshev", "corrected", "first_iterate", "rigid_fit"]
+__all__ = ["coarse_chebyshev", "corrected", "first_iterate"]
 
 Array = NDArray[np.float64]
 
@@ -32,35 +31,30 @@ def corrected(
 ) -> Array:
     """Displacement [V, 3] m after a coarse correction, from the forces of the contacts at the iterate."""
     gradient = problem.gradient(displacement) if gradient is None else gradient
-    return correct(problem, displacement, pushes_of(problem, displacement, gradient), motions=motions)[0]
+    return correct(problem, displacement, pushes_of(problem, displacement, gradient), motions=motions).displacement
 
 
-def first_iterate(problem: StepProblem) -> Array:
-    """u_0 [V, 3] m: every body in its present shape on its rigid course, or at h v if that has the lower energy.
+def first_iterate(problem: StepProblem, guess: Array) -> Array:
+    """u_0 [V, 3] m: every body in its present shape, or at a guess [V, 3] m if that has the lower energy.
 
-    Both are corrected. The present shape keeps the contact forces of the elastic forces at the step's start.
+    Both are corrected. The energy is Phi less |f0|^2 / (2 D). Elastic energies differ by the work of the mean elastic
+    force, to third order: internal forces have no torque, so rigid motions do not change it. For the present shape,
+    contacts answer the elastic forces alone.
     """
-    still = problem.project(problem.hold(np.zeros_like(problem.positions)))
-    pull = np.where(problem.free[:, None], problem.weight[:, None] * (still - problem.target), 0.0)
-    forces = pushes_of(problem, still, problem.gradient(still) - pull)
-    guess = problem.hold(problem.time_step * problem.velocities)
-    kept = correct(problem, rigid_fit(problem, still, guess), forces)[0]
-    moved = corrected(problem, problem.project(guess))
-    lower, component = problem.energies(moved) < problem.energies(kept), problem.values.component
-    return np.where(lower[component, None], moved, kept)
-
-
-def rigid_fit(problem: StepProblem, displacement: Array, goal: Array) -> Array:
-    """The rigid motions [V, 3] m of the bodies that bring an iterate nearest to a goal; contacts are ignored."""
-    toward = replace(problem, target=goal)
-    for bodies, _ in islands(problem):
-        for _ in range(PASSES):
-            rigid = RigidMotions(toward, displacement, bodies)
-            twists = np.asarray(-np.linalg.solve(rigid.hessian, rigid.gradient), np.float64)
-            displacement = rigid.moved(twists)
-            if np.abs(rigid.modes @ twists).max(initial=0.0) < EXACT * rigid.size:
-                break
-    return displacement
+    states = [problem.project(problem.hold(u)) for u in (np.zeros_like(guess), guess)]
+    gradients = [problem.gradient(u) for u in states]
+    elastic = [
+        gradient - np.where(problem.free[:, None], problem.weight[:, None] * (u - problem.target), 0.0)
+        for gradient, u in zip(gradients, states, strict=True)
+    ]
+    forces = [pushes_of(problem, u, g) for u, g in zip(states, (elastic[0], gradients[1]), strict=True)]
+    kept, moved = (correct(problem, u, f) for u, f in zip(states, forces, strict=True))
+    anchors = [0.5 * (f**2).sum(axis=(0, 2)) / problem.weighted_diagonal for f in forces]
+    work = 0.5 * ((elastic[0] + elastic[1]) * (states[1] - states[0])).sum(axis=1) + anchors[0] - anchors[1]
+    component = problem.values.component
+    # clamped bodies have no Phi, and take the guess
+    lower = ~(moved.energies + np.bincount(component, work) >= kept.energies) | np.isinf(kept.energies)
+    return np.where(lower[component, None], moved.displacement, kept.displacement)
 
 
 def coarse_chebyshev(
@@ -81,7 +75,8 @@ def coarse_chebyshev(
     once. Their space is made there, and with `remake` anew after each so many iterations. `observe(k, u_k)` is called
     with every iterate.
     """
-    current = first_iterate(problem) if first is None else first
+    guess = problem.time_step * problem.velocities
+    current = first_iterate(problem, guess) if first is None else first
     radius = min(0.99999, 1.0 - relaxation * problem.smallest_ratio)
     schedule = Guarded(radius, guard_tolerance(problem))
     previous, scale, coming = current, problem.weighted_diagonal[:, None], schedule.omega(0)

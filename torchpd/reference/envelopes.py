@@ -60,6 +60,10 @@ class Envelopes:
     normal_anchors: Array  # [m] l0, N
     tangent_anchors: Array  # [m, 3] t0, N
 
+    def chosen(self, of: Index) -> Envelopes:
+        """Some of the contacts."""
+        return Envelopes(*(getattr(self, item.name)[of] for item in fields(self)))
+
     def tangential(self, vectors: Array) -> Array:
         """The part of vectors [m, 3] along the surfaces."""
         return np.asarray(vectors - (vectors * self.normals).sum(axis=1, keepdims=True) * self.normals)
@@ -92,13 +96,14 @@ class Envelopes:
         return float(((0.5 * self.normal_forces() ** 2 + huber) / self.stiffness).sum())
 
     def second_derivatives(self, radius: Array) -> Array:
-        """Derivatives of -f by the relative displacement [m, 3, 3] N/m for a fixed radius; positive semidefinite."""
-        n, (t, share) = self.normals, self.tangent_forces(radius)
-        b = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
-        along = np.where(share < 1.0, 1.0, 0.0)[:, None, None] * b[:, :, None] * b[:, None, :]
+        """Second derivatives [m, 3, 3] N/m, for a fixed radius, of a quadratic above e that touches it.
+
+        Along a slip that is cut they are r / |b| k, not 0: Newton's step does not overshoot where friction begins to hold.
+        """
+        n, share = self.normals, self.tangent_forces(radius)[1]
         normal = n[:, :, None] * n[:, None, :]
         pushed = (self.normal_forces() > 0.0)[:, None, None]
-        flat = share[:, None, None] * (np.eye(3) - normal - along)
+        flat = share[:, None, None] * (np.eye(3) - normal)
         return np.asarray(self.stiffness[:, None, None] * (np.where(pushed, normal, 0.0) + flat))
 
 

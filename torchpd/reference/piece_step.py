@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -28,9 +28,6 @@ class PieceMotions(Motions):
 
     space: PieceSpace
 
-    # gaps of planes are linear in q, and radii settle within an outer step
-    outer = 1
-
     @cached_property
     def columns(self) -> Index:
         """[N] the unknowns of the island among those of the space."""
@@ -50,14 +47,29 @@ class PieceMotions(Motions):
     def hessian(self) -> Array:
         return np.asarray(self.space.hessian[np.ix_(self.columns, self.columns)])
 
-    def moved(self, motion: Array) -> Array:
+    @property
+    def scale(self) -> float:
+        return abs(self.energy)
+
+    def share(self, motion: Array) -> float:
+        size = max(float(np.ptp(self.problem.positions[body], axis=0).max()) for body in self.bodies)
+        return float(np.abs(self.modes @ motion).max(initial=0.0)) / size
+
+    def after(self, motion: Array) -> PieceMotions:
         displacement = self.displacement.copy()
         displacement[self.vertices] += self.modes @ motion
-        return displacement
+        moved = replace(self, displacement=displacement)
+        # the model: what changes linearly, and the same space
+        for name, value in (("modes", self.modes), ("hessian", self.hessian), ("columns", self.columns)):
+            moved.__dict__[name] = value
+        moved.__dict__["gradient"] = self.gradient + self.hessian @ motion
+        moved.__dict__["energy"] = self.energy + float((self.gradient + 0.5 * self.hessian @ motion) @ motion)
+        return moved
 
-    def energy(self, displacement: Array) -> float:
+    @cached_property
+    def energy(self) -> float:
         components = self.problem.values.component[[body[0] for body in self.bodies]]
-        return float(self.problem.energies(displacement)[components].sum())
+        return float(self.problem.energies(self.displacement)[components].sum())
 
 
 def piece_motions(space: PieceSpace) -> MotionsOf:
