@@ -98,7 +98,7 @@ class Envelopes:
     def second_derivatives(self, radius: Array) -> Array:
         """Second derivatives [m, 3, 3] N/m, for a fixed radius, of a quadratic above e that touches it.
 
-        Along a slip that is cut they are r / |b| k, not 0: Newton's step does not overshoot where friction begins to hold.
+        Along a slip that is cut they are r / |b| k, not 0: Newton's step stops where friction begins to hold.
         """
         n, share = self.normals, self.tangent_forces(radius)[1]
         normal = n[:, :, None] * n[:, None, :]
