@@ -63,7 +63,6 @@ class PieceMotions(Motions):
         for name, value in (("modes", self.modes), ("hessian", self.hessian), ("columns", self.columns)):
             moved.__dict__[name] = value
         moved.__dict__["gradient"] = self.gradient + self.hessian @ motion
-        moved.__dict__["energy"] = self.energy + float((self.gradient + 0.5 * self.hessian @ motion) @ motion)
         return moved
 
     @cached_property

@@ -80,7 +80,7 @@ def _numbers(name: str, value: Any, *, zero: bool = False, infinite: bool = Fals
     array = as_array(full, value, np.float64)
     if array.ndim > 1:
         raise ValueError(f"{full} must be a scalar or one value per tetrahedron [E], got {list(array.shape)}")
-    check_finite(full, np.where(array == np.inf, 1.0, array) if infinite else array)
+    check_finite(full, np.where(np.isinf(array), np.sign(array), array) if infinite else array)
     bad = np.flatnonzero((array < 0.0) if zero else (array <= 0.0))
     if bad.size:
         wanted = ">= 0" if zero else "positive"

@@ -129,9 +129,11 @@ def check_change(
 
 def _refuse_values(owner: str, name: str, value: Tensor | float) -> None:
     """Refuse values of an array without rows, which would have no effect."""
-    tensor = torch.as_tensor(value) if name == PIN_HARD else real_tensor(owner, name, value)
-    if tensor.numel() > 0:
-        came = f"{tensor.item():g}" if tensor.dim() == 0 else list(tensor.shape)
+    tensor = value if isinstance(value, Tensor) else None
+    if name != PIN_HARD:
+        tensor = real_tensor(owner, name, value)
+    if tensor is None or tensor.numel() > 0:
+        came = repr(value) if tensor is None or tensor.dim() == 0 else list(tensor.shape)
         raise ValueError(f"{owner}: {name} has no rows in this scene, so it must be left out, got {came}{_hint(name)}")
 
 

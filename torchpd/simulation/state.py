@@ -115,6 +115,13 @@ def named_state(state: Any) -> State | HistoryState:
     return HistoryState(positions, velocities, History(*history))
 
 
+def _has_history(state: Any) -> bool:
+    """Whether the third part, if there is one, is a history or a tuple or list of its parts."""
+    return len(state) == len(State._fields) or (
+        isinstance(state[2], (tuple, list)) and len(state[2]) == len(History._fields)
+    )
+
+
 def _tensors_by_name(state: Any) -> dict[str, Tensor]:
     """The tensors of a state by name."""
     whole = named_state(state)
@@ -132,7 +139,7 @@ def _where(state: _Some, condition: Any, other: Any) -> _Some:
             f"{kind.__name__}.where: condition must be bool [{len(state.positions)}], one for each environment, got "
             f"{condition.dtype} {list(condition.shape)}"
         )
-    if not isinstance(other, (tuple, list)) or len(other) != len(state):
+    if not isinstance(other, (tuple, list)) or len(other) != len(state) or not _has_history(other):
         raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__}, got {type(other).__name__}")
     theirs_of = _tensors_by_name(other)
     for name, mine in _tensors_by_name(state).items():
