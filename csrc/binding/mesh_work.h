@@ -143,8 +143,8 @@ inline void add_kinds(std::vector<std::int32_t>& sizes, const pd::MeshElements& 
     sizes[pd::stencil_size_count + group.kind] = std::int32_t(group.count);
 }
 
-inline std::vector<std::int32_t> stencil_sizes(const pd::MeshPlan& plan, const pd::MeshElements& elements,
-                                        int lanes) {
+inline std::vector<std::int32_t> stencil_sizes(const pd::MeshPlan& plan,
+                                               const pd::MeshElements& elements, int lanes) {
   std::vector<std::int32_t> sizes(pd::stencil_size_count);
   sizes[pd::stencil_blocks] = std::int32_t(plan.stencil_block.size() / 4);
   sizes[pd::stencil_corner_rows] = std::int32_t(plan.stencil_corner.size() / lanes);

@@ -425,7 +425,7 @@ def test_what_does_not_go_together_is_refused(options: dict[str, Any], words: st
         ((0.1, -1.0), "Plastic.hardening must be >= 0, got -1.0"),
         ((0.1, 0.0, np.nan), "Plastic.creep_time must be finite"),
         ((0.1, 0.0, 0.0, -1.0), "Plastic.max_flow must be positive, got -1.0"),
-        ((0.1, 0.0, 0.0, -np.inf), "Plastic.max_flow must be finite"),
+        ((0.1, 0.0, 0.0, -np.inf), "Plastic.max_flow must be positive, got -inf"),
         ((0.1, 0.0, 0.0, [np.inf, np.nan]), "Plastic.max_flow must be finite"),
         (([[0.1]],), r"Plastic.yield_strain must be a scalar or one value per tetrahedron \[E\], got \[1, 1\]"),
     ],
@@ -449,12 +449,12 @@ def test_material_is_set_by_name() -> None:
 
 def test_the_modulus_of_elastic_solids_is_refused_without_any() -> None:
     sim, _ = bar(iterations=20)
-    for given, came in ((2e5, "200000"), (torch.ones(2, 1), r"\[2, 1\]")):
+    for given, came in ((2e5, r"200000\.0"), (torch.ones(2, 1), r"\[2, 1\]")):
         with pytest.raises(ValueError, match=f"stiffness has no rows in this scene.* got {came}; .*plastic_youngs"):
             sim.set_material(stiffness=given)
     sim.set_material(stiffness=sim.stiffness, plastic_youngs=2e5)
     assert float(sim.plastic_youngs.min()) == 2e5
-    with pytest.raises(ValueError, match=r"pin_hard has no rows in this scene"):
+    with pytest.raises(ValueError, match=r"pin_hard has no rows in this scene.* got True"):
         pd.Simulator(pd.Scene(pd.Solid(BAR, 1e5))).set_material(pin_hard=True)
 
 
