@@ -288,7 +288,7 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
 
     for _ in range(PASSES):
         trial = contacts.shifted(jacobian @ motion)
-        second = trial.second_derivatives(radius)
+        second = trial.majoriser(radius)
         on = second.any(axis=(1, 2))
         matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
         force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion

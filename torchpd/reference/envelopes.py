@@ -95,7 +95,7 @@ class Envelopes:
         huber = np.where(share > 0.0, size**2 * (1.0 / np.maximum(share, 1e-300) - 0.5), 0.0)
         return float(((0.5 * self.normal_forces() ** 2 + huber) / self.stiffness).sum())
 
-    def second_derivatives(self, radius: Array) -> Array:
+    def majoriser(self, radius: Array) -> Array:
         """Second derivatives [m, 3, 3] N/m, for a fixed radius, of a quadratic above e that touches it.
 
         Along a slip that is cut they are r / |b| k, not 0: Newton's step stops where friction begins to hold.
