@@ -24,7 +24,6 @@ from machine import aligned, describe_run, wait_for, write_result
 from tqdm.auto import tqdm
 
 import torchpd as pd
-from torchpd.accuracy.candidates import multilevel_for
 from torchpd.accuracy.error import ExactStep, exact_steps
 from torchpd.estimate.convergence import forecast
 from torchpd.estimate.solver_choice import runs
@@ -82,7 +81,7 @@ def run_scene(name: str, device: torch.device, seconds: float) -> Row:
     )  # fmt: skip
     solvers: dict[str, tuple[Solver, list[int]]] = {
         "Chebyshev": (pd.Chebyshev(), CHEBYSHEV),
-        "Multilevel": (multilevel_for(sim.compiled), MULTILEVEL),
+        "Multilevel": (pd.Multilevel(), MULTILEVEL),
     }
     for label, (solver, counts) in solvers.items():
         if not runs(solver, sim.compiled):

@@ -44,7 +44,6 @@ if load_extension()[0] is not None:
     from .simulation.cuda_graph import CapturedStep
     from .simulation.distributed import keep_material_per_rank
     from .simulation.readouts import ContactForces, Reactions
-    from .simulation.rigid_pieces import RigidPieces
     from .simulation.stencil_readouts import MembraneStress, Tension
     from .simulation.stress import Stress
 __all__ = [
@@ -83,7 +82,6 @@ __all__ = [
     "QuadricTransport",
     "Quadrics",
     "Reactions",
-    "RigidPieces",
     "Rod",
     "Scene",
     "SceneWarning",

@@ -34,6 +34,7 @@ enum LevelSize : int {
   level_middle_prolongations,
   level_middle_nodes,  // below the middle level
   level_direct,        // 1: no levels, A itself is solved directly
+  level_pieces,        // of the coarse space of L-BFGS
   level_size_count
 };
 
@@ -44,7 +45,7 @@ struct Levels {
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/multilevel.def"
 #undef X
-  int vertices = 0, fine_nodes = 0, middle_nodes = 0;
+  int vertices = 0, fine_nodes = 0, middle_nodes = 0, pieces = 0;
   bool direct = false;
 
   PD_HD bool there() const { return fine_start != nullptr; }
@@ -62,6 +63,7 @@ Levels<T> count_levels(const int32* sizes, int vertices) {
   levels.fine_nodes = sizes[level_fine_nodes];
   levels.middle_nodes = sizes[level_middle_nodes];
   levels.direct = sizes[level_direct] != 0;
+  levels.pieces = sizes[level_pieces];
   return levels;
 }
 
@@ -275,8 +277,7 @@ enum class ScheduleKind : int {
   classic = 1,
   guarded = 2,
   lbfgs = 3,
-  momentum = 4,
-  corotated = 5
+  momentum = 4
 };
 enum class StartKind : int { velocity = 0, inertial = 1, given = 2 };
 

@@ -106,7 +106,7 @@ class Tables:
 
     def __init__(self, plan: Plan) -> None:
         t = {row.name: array.numpy() for row, array in zip(plan.table, plan.arrays, strict=True)}
-        count, (_, _, nodes, _, _, below, direct) = len(t["vertex_order"]), t["level_sizes"].tolist()
+        count, (_, _, nodes, _, _, below, direct, _) = len(t["vertex_order"]), t["level_sizes"].tolist()
         self.order = t["vertex_order"]
         self.levels = []
         if not direct:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..estimate.solver_choice import runs
-from ..plan.compiled import CompiledScene
 from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Solver
 from ..simulation.state import State
 from .spectral_radius import estimate_rho
@@ -15,12 +14,7 @@ from .spectral_radius import estimate_rho
 if TYPE_CHECKING:
     from ..simulation.stepper import Stepper
 
-__all__ = ["CANDIDATES", "DEFAULT", "DEFAULT_ITERATIONS", "Candidate", "multilevel_for", "safe_candidates"]
-
-
-def multilevel_for(compiled: CompiledScene) -> Multilevel:
-    """The default schedule of `Multilevel` or, with other parts than solids, the one that takes them."""
-    return Multilevel("lbfgs") if compiled.has_stencils else Multilevel()
+__all__ = ["CANDIDATES", "DEFAULT", "DEFAULT_ITERATIONS", "Candidate", "safe_candidates"]
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,7 @@ CANDIDATES: dict[str, Candidate] = {
     "damped Jacobi": Candidate(lambda sim, state: Jacobi(relaxation=1.9), safe=True),
     "classic Chebyshev": Candidate(_classic, safe=False),
     "guarded Chebyshev": Candidate(lambda sim, state: Chebyshev(), safe=True),
-    "Multilevel": Candidate(lambda sim, state: multilevel_for(sim.compiled), safe=True),
+    "Multilevel": Candidate(lambda sim, state: Multilevel(), safe=True),
 }
 DEFAULT = "guarded Chebyshev"  # the solver of `Simulator(scene)`
 

@@ -35,7 +35,6 @@ from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
 from ..simulation.state import History, HistoryState, State, named_state
 from ..simulation.surface_loads import SurfaceLoads
-from .candidates import multilevel_for
 from .unsolved_step import ROUNDINGS
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ Array = NDArray[np.float64]
 # With contacts, each solves scenes on which the others stagnate.
 _SOLVERS: tuple[tuple[Solver, int], ...] = ((Multilevel(), 50), (Multilevel("momentum"), 100), (Chebyshev(), 500))
 # With other parts, a step has several minima where something buckles: the one that the default solver goes to counts.
-_OF_STENCILS: tuple[tuple[Solver, int], ...] = ((Chebyshev(), 2000), (Multilevel("lbfgs"), 50))
+_OF_STENCILS: tuple[tuple[Solver, int], ...] = ((Chebyshev(), 2000), (Multilevel(), 50))
 _LONG = 40_000  # least limit of iterations there
 _SOLVED = 1e-13  # residual at which a solver ends
 _NEARLY = 1e-9  # residual that may be the lowest that rounding allows
@@ -313,7 +312,7 @@ def settled_steps(
         problems = [problem_of(sim, state, item, forces=forces) for item in range(len(wide.positions))]
         first = torch.from_numpy(np.stack([problem.unsolved() for problem in problems]))
         after, moves = (
-            run(multilevel_for(sim.compiled), _LEADING),
+            run(Multilevel(), _LEADING),
             [torch.inf * torch.ones(len(first), dtype=torch.float64)],
         )
         for iterations in _SETTLING:

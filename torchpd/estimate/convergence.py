@@ -53,7 +53,7 @@ __all__ = [
 
 _LARGEST_RHO = 0.99999  # of the guarded schedule, see csrc/solver/chebyshev.h
 # Multilevel: iterations per tenth of the error = least + slope * log10(1 / (mu n^(2/3)))
-_LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"corotated": 2.0, "lbfgs": 3.0, "momentum": 3.0}
+_LEVELS_LEAST, _LEVELS_SLOPE = 2.0, {"lbfgs": 2.0, "momentum": 3.0}
 # Multilevel at an impact: factors on the Chebyshev count for an error of 1e-3, and on its square root
 _LANDING_SHARE, LANDING_ROOTS = 1.0 / 7.0, 2.0
 # limits of an even body: smallest dihedral angle, and largest ratio of stiffness between tetrahedra. `tetrahedralize`
@@ -162,7 +162,7 @@ def forecast(
     middle = 1.0 - theta * (1.0 + spectrum.slow) / 2.0
     left = max(_decay(slowest, limit), _decay(middle, limit), 1e-3)
     rate = -math.log(min(left, 1.0 - 1e-15))
-    lands = isinstance(solver, Multilevel) and solver.outer == "corotated" and not held_up_by(compiled)
+    lands = isinstance(solver, Multilevel) and solver.outer == "lbfgs" and not held_up_by(compiled)
     if lands:
         plain = math.log(1e3) / rate
         usual = LANDING_ROOTS * math.sqrt(plain)

@@ -54,10 +54,6 @@ MOST_OF_CHEBYSHEV = 10_000
 # Factor on the time of a Multilevel iteration with contacts. Resting boxes of 125 to 9,261 vertices, compared with
 # swinging ones, took 1.1 to 1.7 times as long on an H100, 1.1 to 1.4 times on the CPU.
 ON_CONTACTS = 1.4
-MAKING = 3  # least iterations of "lbfgs" that "corotated" must save
-
-
-_LEVELS = (Multilevel(), Multilevel("lbfgs"))
 
 
 class Cost(NamedTuple):
@@ -144,10 +140,8 @@ def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solv
         plain = _known(forecast(compiled, chebyshev, spectrum))
         why = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}, and {cause} may stall Multilevel"
         return chebyshev, chosen(_enough(plain), why)
-    plain, lasting, short = (_known(forecast(compiled, solver, spectrum)) for solver in (chebyshev, *_LEVELS))
-    # the other schedules do not treat contacts
-    saves = has_contacts(compiled) or short.iterations(AIM) - lasting.iterations(AIM) >= MAKING
-    multilevel, levels = (_LEVELS[0], lasting) if saves else (_LEVELS[1], short)
+    multilevel = Multilevel()
+    plain, levels = (_known(forecast(compiled, solver, spectrum)) for solver in (chebyshev, multilevel))
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
     if not runs(multilevel, compiled):
         where = (

@@ -47,7 +47,7 @@ _OF_SOLIDS = {
 }
 
 _ANY_BATCH = 2**31 - 1
-_TURNING_MODES = 24  # of the coarse problem of Multilevel("corotated"), see csrc/solver/multilevel/deflation.h
+_MODES = 6  # of a piece of the coarse space of Multilevel("lbfgs"), see csrc/solver/multilevel/pieces.h
 
 
 def _solver_line(sim: Stepper) -> str:
@@ -102,7 +102,7 @@ def _preconditioner_lines(sim: Stepper) -> list[str]:
     if not has_preconditioner(plan.arrays):
         return []
     whose = "" if isinstance(sim.solver, Multilevel) else " of gradients"
-    _, _, nodes, _, _, below, direct = plan.level_sizes.tolist()
+    _, _, nodes, _, _, below, direct, _ = plan.level_sizes.tolist()
     steps = [f"{plan.vertices} vertices", *(f"{count} nodes" for count in (nodes, below) if count)]
     solved = "solved directly" if direct else "the last solved directly"
     own = sum(array.numel() * array.element_size() for array in plan.arrays[-len(MULTILEVEL_TABLE) :])
@@ -249,12 +249,11 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
         return real * numbers
     # four vectors of an iteration, four of a V-cycle, and eight L-BFGS pairs
     numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
-    if solver.outer != "corotated":
+    if solver.outer == "momentum":
         return real * numbers
-    # the coarse problem: 16 numbers per vertex, A times these, sums per 256 vertices and per patch, and two inverses
-    products, pairs = 2 * 16 * 16, _TURNING_MODES * (_TURNING_MODES + 1) // 2
-    sums = products * -(-plan.vertices // 256) + pairs * plan.patches
-    return real * (numbers + 32 * plan.vertices) + 8 * (sums + 2 * _TURNING_MODES**2)
+    # the coarse space: two vectors, and two dense matrices of all pieces
+    pieces = int(plan.level_sizes[-1])
+    return real * (numbers + 8 * plan.vertices) + 8 * 2 * (_MODES * pieces) ** 2
 
 
 def _step_bytes(sim: Stepper, real: int) -> str:

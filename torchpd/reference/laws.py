@@ -37,6 +37,12 @@ def scaled(factor: Array, matrices: Array) -> Array:
     return np.asarray(factor[:, None, None] * matrices)
 
 
+def _clamped(blocks: Array) -> Array:
+    """Symmetric matrices with their negative eigenvalues set to zero."""
+    values, vectors = np.linalg.eigh(blocks)
+    return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2))
+
+
 @dataclass(frozen=True)
 class Coupling:
     """A part of the Hessian that joins elements: sum over groups of factor_g (sum_e rows_e : dF_e)^2."""
@@ -104,10 +110,16 @@ class Law(ABC):
                 columns.append(np.swapaxes(along(dF), 1, 2).reshape(count, -1))
         blocks = np.stack(columns, axis=2)
         blocks = 0.5 * (blocks + np.swapaxes(blocks, 1, 2))
-        if not positive:
-            return blocks
-        values, vectors = np.linalg.eigh(blocks)
-        return np.asarray((vectors * np.maximum(values, 0.0)[:, None]) @ np.swapaxes(vectors, 1, 2))
+        return _clamped(blocks) if positive else blocks
+
+    def blocks_alone(self, F: Array) -> Array:
+        """Second derivative of each element by itself [N, 3 d, 3 d] with its part of `coupling`, clamped at zero."""
+        joined = self.coupling(F)
+        if joined is None:
+            return self.blocks(F, positive=True)
+        rows = np.swapaxes(joined.rows, 1, 2).reshape(len(F), -1)
+        part = joined.factor[joined.group][:, None, None] * rows[:, :, None] * rows[:, None, :]
+        return _clamped(self.blocks(F, positive=False) + part)
 
     def coupling(self, F: Array) -> Coupling | None:
         """The part of the second derivative that `blocks` lacks."""
@@ -227,6 +239,19 @@ class Corotated(Law):
             softening = np.minimum(softening, 1.0) if positive else softening
             blocks -= softening[:, None, None] * mode[:, :, None] * mode[:, None, :]
         return scaled(self.shear * self.measure, blocks)
+
+    def blocks_alone(self, F: Array) -> Array:
+        """For d = 3 linear elasticity in the frame of the element: 2 mu |sym(dF R^T)|^2 + lambda tr(dF R^T)^2."""
+        if F.shape[2] == 2:
+            return super().blocks_alone(F)
+        R = nearest_orthonormal(F)
+        basis = np.swapaxes(np.eye(9).reshape(9, 3, 3), 1, 2)
+        turned = np.einsum("kij,nlj->nkil", basis, R)
+        even = (0.5 * (turned + np.swapaxes(turned, 2, 3))).reshape(-1, 9, 9)
+        trace = np.einsum("nkii->nk", turned)
+        shear, bulk = self.shear * self.measure, self.bulk * self.measure
+        own = even @ np.swapaxes(even, 1, 2)
+        return scaled(shear, own) + scaled(bulk, trace[:, :, None] * trace[:, None, :])
 
     def _cap_rates(self, rate: Array) -> dict[str, Array]:
         """Derivatives through c [N], from dE/dc [groups]."""

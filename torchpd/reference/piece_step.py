@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .coarse import Motions, MotionsOf
-from .pieces import Pieces, PieceSpace
+from .pieces import Pieces, PieceSpace, thinned
 
 if TYPE_CHECKING:
     from .problem import StepProblem
@@ -76,31 +76,46 @@ def piece_motions(space: PieceSpace) -> MotionsOf:
     return lambda problem, displacement, bodies: PieceMotions(problem, displacement, bodies, space)
 
 
+NOISE = 1e-12  # of the diagonal of Ac: pieces that move together depend on each other
+SLOW = 0.75  # share of the decrease that the slope promises
+TRIALS = 2  # iterations in a row that fall short of it, after which the space is made anew
+
+
 @dataclass
 class PieceCycle:
     """The preconditioner M + Z (Hc^-1 - Ac^-1) Z^T / relaxation of L-BFGS, which multiplies it by the relaxation.
 
     A is far too stiff for pieces that turn: it penalises every departure from the current rotations. For nu = 0 the sum
     is at least M, because Hc <= Ac; else it takes at most 2 / 3 of Ac^-1 from 1.8 M. Before the iterate `first` it is
-    M alone; there, and after every `every` further iterations, Z, Hc and Ac are made anew. The secant pairs stay.
+    M alone; there Z, Hc and Ac are made. They are made anew after `TRIALS` iterations in a row that lowered E by less
+    than `SLOW` of half the slope, which they would if H were still what it was. The secant pairs stay.
     """
 
     problem: StepProblem
     cycle: Callable[[Array], Array]  # applies M
     pieces: Pieces
-    every: int = 0  # 0: made once
+    remakes: bool = True
     first: int = 2
     relaxation: float = 1.8
     made: int = field(default=0, init=False)  # how many times
     _small: tuple[PieceSpace, Array] | None = field(default=None, init=False)
+    _slow: int = field(default=0, init=False)
+    _last: tuple[Array, float, Array] | None = field(default=None, init=False)  # u, E and its gradient
 
     def observe(self, iteration: int, displacement: Array) -> None:
         """Make the coarse space if it is time; the observer of `preconditioned_lbfgs`."""
-        since = iteration - self.first
-        if since == 0 or (self.every and since > 0 and since % self.every == 0):
-            space = PieceSpace(self.problem, self.pieces, displacement)
-            self._small = space, np.linalg.inv(space.hessian) - np.linalg.inv(space.matrix)
-            self.made += 1
+        energy, gradient = self.problem.evaluate(displacement)
+        if self._last is not None:
+            before, energy_before, gradient_before = self._last
+            promised = -0.5 * float(np.vdot(gradient_before, displacement - before))
+            if promised > 1e-12 * abs(energy_before):
+                self._slow = 0 if energy_before - energy >= SLOW * promised else self._slow + 1
+        self._last = displacement, energy, gradient
+        if iteration == self.first or (self.remakes and self.made and self._slow >= TRIALS):
+            space = PieceSpace(self.problem, thinned(self.pieces), displacement)
+            noise = NOISE * np.diag(np.diag(space.matrix))
+            self._small = space, np.linalg.inv(space.hessian_alone + noise) - np.linalg.inv(space.matrix + noise)
+            self._slow, self.made = 0, self.made + 1
 
     def __call__(self, gradient: Array) -> Array:
         product = self.cycle(gradient)

@@ -138,7 +138,7 @@ class Chebyshev:
         }
 
 
-_SCHEDULES = {"corotated": 5, "lbfgs": 3, "momentum": 4}  # numbers of Multilevel.outer in the ops
+_SCHEDULES = {"lbfgs": 3, "momentum": 4}  # numbers of Multilevel.outer in the ops
 
 
 @dataclass(frozen=True)
@@ -150,9 +150,8 @@ class Multilevel:
     on a CPU, and 11 to 29 times on a GPU. The scene takes longer to compile.
 
     A line search checks the energy of each iterate. After four rejected trials in a row, two accelerated Jacobi
-    iterations follow, then four, eight and so on. With contacts, "corotated" shortens rejected trials instead. It takes
-    Jacobi iterations after twelve rejections, or with friction after the first two. "lbfgs" and "momentum" do not model
-    contacts; with friction, "lbfgs" takes Jacobi iterations at once.
+    iterations follow, then four, eight and so on. With contacts, "lbfgs" shortens rejected trials instead. It takes
+    Jacobi iterations after twelve rejections, or with friction after the first two. "momentum" does not model contacts.
 
     M is prepared once, for the material of that time (`Simulator.prepare_solver`). An environment with another material
     gets M / s, where s is its largest ratio of inertia or stiffness to that material; `Info.rho` reports the mismatch.
@@ -161,13 +160,14 @@ class Multilevel:
     See docs/solvers.md and docs/theory.md.
 
     Args:
-        outer: "lbfgs" corrects M by the last eight steps; "momentum" extrapolates, without inner products. "corotated"
-            is "lbfgs" with a coarse correction at the current positions, for parts that rotate or rest on contacts.
-        relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8. "corotated" halves it
+        outer: "lbfgs" corrects M by the last eight steps, and by a coarse space at the current positions: rigid
+            motions of up to 64 pieces, for parts that rotate, stiff parts and contacts. "momentum" extrapolates,
+            without inner products.
+        relaxation: theta of x - theta M grad E, in (0, 2). None: 1.9 for "momentum", else 1.8. "lbfgs" halves it
             while contacts without friction hold vertices, because M is too soft there.
     """
 
-    outer: Literal["corotated", "lbfgs", "momentum"] = "corotated"
+    outer: Literal["lbfgs", "momentum"] = "lbfgs"
     relaxation: float | None = None
 
     def __post_init__(self) -> None:

@@ -128,12 +128,6 @@ def _planned_anew(now: Configuration) -> Configuration:
 
 
 def _solved_by(now: Configuration, solver: Solver) -> Configuration:
-    if isinstance(solver, Multilevel) and solver.outer == "corotated" and now.has_stencils:
-        raise ValueError(
-            'Simulator: solver must not be Multilevel("corotated"), the default of Multilevel, for a scene with cloth, '
-            "rods, springs, ties, fibres or plastic solids: its coarse correction knows tetrahedra alone. "
-            'Give Multilevel("lbfgs")'
-        )
     # the same number of iterations means another error for another solver
     checked = EVERY_STEP if now.named_iterations else NO_STEP
     now = replace(now, solver=solver, choice=None, checked_time_steps=checked)

@@ -1,7 +1,7 @@
 // Runner of solver/multilevel/lbfgs.h on the CPU: a Stepper with other iterations.
 #pragma once
-#include "cpu/multilevel/deflation.h"
 #include "cpu/multilevel/material_mismatch.h"
+#include "cpu/multilevel/pieces.h"
 #include "cpu/multilevel/workspace.h"
 #include "cpu/step/stepper.h"
 #include "solver/multilevel/trial_vertex.h"
@@ -30,8 +30,8 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
       : Base(call, work, scratch, team, first),
         o_(outer),
         lbfgs_(set_.learns()),
-        corotates_(set_.schedule == ScheduleKind::corotated),
-        corotation_(plan_, team, work, outer.corotation) {}
+        pieces_(plan_, team, work, outer.pieces),
+        has_space_(pieces_.there()) {}
 
   // All steps of the call, with a record every `set_.every`.
   void rollout() {
@@ -49,18 +49,17 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
   void start() {
     Base::start();
     newest_ = 0;
-    corotated_ = false;
+    uses_space_ = false;
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       const bool has_friction = Lanes::lane(friction, lane) > 0;
-      search_[lane].begin(mismatch_[lane], HasContacts, has_friction, corotates_, energy_noise<T>(),
+      search_[lane].begin(mismatch_[lane], HasContacts, has_friction, has_space_, energy_noise<T>(),
                           this->stop_[lane].free_fall);
       pairs_[lane] = {};
-      made_[lane] = doubted_[lane] = 0;
-      has_[lane] = holds_[lane] = false;
-      if (corotates_) corotation_.forget(lane);
+      made_[lane] = holds_[lane] = false;
       schedule_[lane].rho = mismatch_[lane].spread;
     }
+    if (has_space_) pieces_.forget();
   }
 
   void minimise() { multilevel_iterations(*this, set_); }
@@ -115,7 +114,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
       const Value s = k == 0 ? none_ : restricted(i, change);
       const Value y = k == 0 ? none_ : restricted(i, o_.trial_residual[i] - o_.residual[i]);
       if constexpr (HasContacts) {
-        for (int a = 0; corotates_ && a < 3; ++a) {
+        for (int a = 0; has_space_ && a < 3; ++a) {
           const Value d = Lanes::value(o_.trial_free[i].row[a]) - Lanes::value(o_.free[i].row[a]);
           sum[2 * history + 3] = multiply_add(d, d, sum[2 * history + 3]);
         }
@@ -171,7 +170,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
 
   // direction = theta M g, corrected by secant pairs; the diagonal serves blocked directions and outliers
   void precondition() {
-    if (corotates_) corotate(iteration_);
+    if (has_space_) find_space(iteration_);
     Real alpha[history] = {}, scale;
     for (int lane = 0; lane < width; ++lane) {
       for (int j = 0; j < history; ++j) Lanes::set_lane(alpha[j], lane, T(pairs_[lane].alpha[j]));
@@ -186,10 +185,10 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
       }
       in[i] = scale * q;
     });
-    if (!corotated_) {
+    if (!uses_space_) {
       o_.cycle.run(team_);
     } else {
-      run_corotated(scale);
+      run_with_space(scale);
     }
     if (lbfgs_) return correct();
     each_vertex([&](std::int64_t i) { o_.direction[i] = o_.cycle.result()[i]; });
@@ -203,8 +202,8 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
     for (int lane = 0; lane < width; ++lane) {
       LineSearch& search = search_[lane];
       const bool goes = !done_[lane], falls_back = goes && (search.plain_jacobi || search.jacobi);
-      const double b = goes ? search.propose(schedule_[lane].limit, lbfgs_, has_[lane],
-                                             corotates_ && made_[lane] == 0, is_held(lane))
+      const double b = goes ? search.propose(schedule_[lane].limit, lbfgs_, made_[lane],
+                                             has_space_ && !made_[lane], is_held(lane))
                             : 0;
       Lanes::set_lane(beta, lane, T(b));
       Lanes::set_lane(length, lane, T(goes ? (1 + b) * search.trial_length() : 0));
@@ -242,56 +241,49 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
   // whether the coarse problem includes contacts
   bool is_held(int lane) const {
     if constexpr (!HasContacts) return false;
-    return made_[lane] > 0 && corotation_.is_held(lane);
+    return made_[lane] && pieces_.is_held(lane);
   }
 
-  // Builds the coarse problem of the lanes that need it at iteration k, at their iterates.
-  void corotate(int k) {
+  // Makes the coarse space of the lanes that need it at iteration k, at their iterates.
+  void find_space(int k) {
     bool asks[width], some = false;
+    double scales[width];
     for (int lane = 0; lane < width; ++lane) {
       LineSearch& search = search_[lane];
-      const TurningPlan plan(k, made_[lane], search.restarts - doubted_[lane], HasContacts,
-                             search.rebuilds_coarse());
-      asks[lane] = false;
-      // alone this lane would not be here
-      if (search.jacobi) continue;
-      asks[lane] = !done_[lane] && plan.make;
+      scales[lane] = search.scale;
+      const bool begins = k >= (HasContacts ? touching_pieces_begin : pieces_begin);
+      // alone a lane of Jacobi iterations would not be here
+      asks[lane] =
+          !done_[lane] && !search.jacobi && (made_[lane] ? search.is_outdated() : begins);
       some = some || asks[lane];
-      if (plan.forget) corotation_.forget(lane);
-      has_[lane] = asks[lane] || (has_[lane] && !plan.forget);
       if (!asks[lane]) continue;
-      ++made_[lane];
-      doubted_[lane] = search.restarts;
-      search.path_since_coarse = 0;
+      made_[lane] = true;
       holds_[lane] = false;
+      search.rebuilt();
     }
-    double scales[width];
-    for (int lane = 0; lane < width; ++lane) scales[lane] = search_[lane].scale;
-    if (some) corotation_.make(o_.iterate, asks, scales);
-    corotated_ = std::any_of(has_, has_ + width, [](bool has) { return has; });
+    if (some) pieces_.make(o_.iterate, asks, scales);
+    uses_space_ = std::any_of(made_, made_ + width, [](bool made) { return made; });
     if constexpr (HasContacts) {
       bool holds[width];
       for (int lane = 0; lane < width; ++lane) {
-        holds[lane] = has_[lane] && !holds_[lane] && !done_[lane] && !search_[lane].jacobi;
+        holds[lane] = made_[lane] && !holds_[lane] && !done_[lane] && !search_[lane].jacobi;
         holds_[lane] = holds_[lane] || holds[lane];
       }
-      if (corotated_) corotation_.hold(o_.free, holds, scales);
+      if (uses_space_) pieces_.hold(o_.free, holds);
     }
   }
 
-  // the cycle with the coarse problem, which encloses it where contacts or outliers hold vertices that M leaves free
-  void run_corotated(const Real& scale) {
+  // the cycle with the coarse space, which encloses it where contacts or outliers hold vertices that M leaves free
+  void run_with_space(const Real& scale) {
     Value *in = o_.cycle.input(), *z = o_.cycle.result();
     bool around[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
       around[lane] = !plan_.levels.direct && (HasContacts || mismatch_[lane].has_outliers);
       some = some || around[lane];
     }
-    corotation_.measure(in, around);
-    if (some) each_vertex([&](std::int64_t i) { in[i] = corotation_.without(i, in[i]); });
+    pieces_.before(in, around, some);
     o_.cycle.run(team_);
-    corotation_.answer(z, around, some, scale);
-    each_vertex([&](std::int64_t i) { z[i] = corotation_.with(i, z[i]); });
+    pieces_.after(z, around, some, scale);
   }
 
   // `a` where the lane accepted its trial, else `b`
@@ -400,13 +392,13 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
   }
 
   Work& o_;
-  bool lbfgs_, corotates_, corotated_ = false;
+  bool lbfgs_, uses_space_ = false;
   Outliers<Real> outliers_{false, Real(T(1))};  // in any lane
   int newest_ = 0, iteration_ = 0;
-  bool has_[width] = {};                        // the lane has a coarse problem
-  bool holds_[width] = {};                      // includes the contacts at the iterate
-  int made_[width] = {}, doubted_[width] = {};  // coarse problems built, and failed trials by then
-  Corotation<Lanes> corotation_;
+  bool made_[width] = {};   // the step has made the coarse space of the lane
+  bool holds_[width] = {};  // includes the contacts at the iterate
+  PiecesOfTeam<Lanes> pieces_;
+  bool has_space_;
   Value none_ = Lanes::value({Real(T(0)), Real(T(0)), Real(T(0))});
   Real accepted_{T(1)}, finite_{T(1)};
   MaterialMismatch mismatch_[width];

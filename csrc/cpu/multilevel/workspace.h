@@ -1,6 +1,6 @@
 // Memory of the multilevel solver's iterations.
 #pragma once
-#include "cpu/multilevel/deflation_workspace.h"
+#include "cpu/multilevel/pieces_workspace.h"
 #include "cpu/multilevel/v_cycle.h"
 #include "math/mat.h"
 
@@ -17,7 +17,7 @@ struct MultilevelWork {
   static constexpr int chunk = 256;             // vertices in one partial sum
 
   Cycle<Lanes> cycle;
-  CorotationWork<Lanes> corotation;
+  PiecesWork<Lanes> pieces;
   Value *iterate, *residual, *trial_residual,
       *direction;  // [vertices] iterate, residual there, residual at the trial, direction
   Value *s[history], *y[history];  // [vertices] L-BFGS pairs
@@ -31,8 +31,8 @@ struct MultilevelWork {
 
   MultilevelWork(const StepCall<typename Lanes::Scalar>& call, bool has_contacts, int threads)
       : cycle(call.plan.levels),
-        corotation(call.plan, call.settings.schedule == ScheduleKind::corotated, has_contacts,
-                   call.effects.poisson.data != nullptr, threads),
+        pieces(call.plan, call.settings.learns(), has_contacts,
+               call.effects.poisson.data != nullptr, threads),
         chunks((call.plan.vertices + chunk - 1) / chunk) {
     const bool pairs = call.settings.learns();
     const std::int64_t n = call.plan.vertices, held = has_contacts ? n : 0;

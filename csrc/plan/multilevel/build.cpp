@@ -3,6 +3,7 @@
 #include "plan/multilevel/aggregate.h"
 #include "plan/multilevel/block_matrix.h"
 #include "plan/multilevel/fine_matrix.h"
+#include "plan/multilevel/pieces.h"
 #include "solver/multilevel/lbfgs.h"
 
 #include <algorithm>
@@ -176,15 +177,6 @@ std::vector<double> scaled_inverse(const BlockMatrix& a, int threads) {
   for (std::size_t i = 0; i < d.size(); ++i)
     inverse[i] = d[i] > 0 ? 1 / (1.05 * largest * d[i]) : 0;
   return inverse;
-}
-
-// Merges aggregates of neighbouring numbers, if the graph has more components than the dense level can hold.
-Aggregates limited(Aggregates groups, std::int32_t most) {
-  if (groups.count <= most) return groups;
-  for (std::int32_t& g : groups.of)
-    g = g < 0 ? g : std::int32_t(std::int64_t(g) * most / groups.count);
-  groups.count = most;
-  return groups;
 }
 
 // L^-1 of a matrix L L^T, row by row up to the diagonal; the rows of held vertices are zero.
@@ -400,7 +392,11 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   const Affine rest = affine(scene);
   const Graph graph = coupling_graph(
       fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0));
-  t.turning_weight = turning_weights(graph, fine.held, rest.position);
+  Pieces pieces = cut_pieces(fine, graph, t.reference_inertia);
+  t.level_sizes[level_pieces] = pieces.count;
+  t.piece_of = std::move(pieces.of);
+  t.piece_weight = std::move(pieces.weight);
+  if (scene.folded) t.turning_weight = turning_weights(graph, fine.held, rest.position);
   if (scene.elements.vertices <= scene.most_direct) {
     t.level_sizes[level_direct] = 1;
     t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);

@@ -21,7 +21,11 @@ constexpr int most_reductions = 12;          // before a fallback, which is 2, 4
 constexpr int most_contact_doublings = 3;
 constexpr int unsettled_fallbacks = 3,
               unsettled_failures = 2;  // with friction the first fallbacks come earlier
-// share of the path of a step after which the coarse problem is rebuilt; that costs one or two iterations
+// Without contacts the coarse problem is rebuilt after so many trials in a row that lowered E by less than this share of what the
+// slope promises, half of it at full length: then H has changed.
+constexpr double slow_share = 0.75;
+constexpr int slow_trials = 2;
+// With contacts: share of the path of a step after which it is rebuilt; that costs one or two iterations
 constexpr double coarse_rebuild_share = 0.1;
 constexpr double least_step_length = 1e-8;
 
@@ -67,6 +71,7 @@ struct LineSearch {
   int reductions = 0, fallbacks = 0;
   // path length of accepted trials: in all, and since the coarse problem was built
   double path = 0, path_since_coarse = 0;
+  int slow = 0;  // trials in a row that lowered E by less than the slope promises
 
   // step length of the next trial
   PD_HD double trial_length() const {
@@ -93,6 +98,7 @@ struct LineSearch {
     const double length_taken = trial_length();
     const bool preconditioned = !plain_jacobi && !jacobi;
     const double demanded = armijo && preconditioned ? armijo_factor * length_taken * slope : 0;
+    if (preconditioned) judge(trial, length_taken);
     const bool decreased = !known || trial <= energy - demanded + slack * absolute(energy);
     // friction has no energy: with it the Jacobi iteration is a fixed-point map, and continues
     accepted = decreased || ((plain_jacobi || jacobi) && friction && trial < HUGE_VAL);
@@ -159,9 +165,16 @@ struct LineSearch {
     path += sqrt(change);
     path_since_coarse += sqrt(change);
   }
-  // whether to rebuild the coarse problem: in a step with failures, after enough of its path
+  // whether to rebuild the coarse problem: with contacts in a step with failures, after enough of its path
   PD_HD bool rebuilds_coarse() const {
     return accepted && restarts > 0 && path_since_coarse > coarse_rebuild_share * path;
+  }
+  PD_HD bool is_outdated() const {
+    return shortens ? rebuilds_coarse() : slow >= slow_trials && path_since_coarse > 0;
+  }
+  PD_HD void rebuilt() {
+    path_since_coarse = 0;
+    slow = 0;
   }
 
   // Whether the slope g.d of a direction is negative. If not, the secant pairs do not hold here.
@@ -195,6 +208,13 @@ struct LineSearch {
   }
 
  private:
+  // Counts trials that fell short of the model E - t g.d + t^2 / 2 g.d; rounding can judge none.
+  PD_HD void judge(double trial, double length) {
+    const double promised = slope * length * (1 - 0.5 * length);
+    if (!known || !(promised > slack * absolute(energy))) return;
+    slow = energy - trial >= slow_share * promised ? 0 : slow + 1;
+  }
+
   // the largest momentum with M
   PD_HD static double momentum_limit() {
     const double b = (1 - sqrt(1 - momentum_rho * momentum_rho)) / momentum_rho;
