@@ -46,7 +46,7 @@ constexpr int level_arrays = 0
 
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
-  std::int64_t level_size, element, vertex, device_vertex, fine_end, fine_entry, fine_prolongation,
+  std::int64_t level_size, element, vertex, device_vertex, piece_pack, fine_end, fine_entry, fine_prolongation,
       host_fine_prolongation, device_fine_prolongation, fine_node_end, middle_end, middle_entry,
       middle, middle_prolongation, host_middle_prolongation, device_middle_prolongation,
       middle_node_end, coarse_entry, device_coarse_entry;
@@ -133,6 +133,7 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, std::int64
   count.middle_prolongation = size[level_middle_prolongations];
   count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
   count.coarse_entry = coarse * (coarse + 1) / 2;
+  count.piece_pack = levels.piece_packs;
   const bool on_device = place.device.is_cuda();
   count.device_vertex = on_device ? vertices : 0;
   (on_device ? count.device_fine_prolongation : count.host_fine_prolongation) =

@@ -35,6 +35,7 @@ enum LevelSize : int {
   level_middle_nodes,  // below the middle level
   level_direct,        // 1: no levels, A itself is solved directly
   level_pieces,        // of the coarse space of L-BFGS
+  level_piece_packs,   // of tetrahedra that the same pieces move; 0 on a GPU
   level_size_count
 };
 
@@ -45,7 +46,7 @@ struct Levels {
 #define X(name, type, width, rows, meaning) const type* name = nullptr;
 #include "views/multilevel.def"
 #undef X
-  int vertices = 0, fine_nodes = 0, middle_nodes = 0, pieces = 0;
+  int vertices = 0, fine_nodes = 0, middle_nodes = 0, pieces = 0, piece_packs = 0;
   bool direct = false;
 
   PD_HD bool there() const { return fine_start != nullptr; }
@@ -64,6 +65,7 @@ Levels<T> count_levels(const int32* sizes, int vertices) {
   levels.middle_nodes = sizes[level_middle_nodes];
   levels.direct = sizes[level_direct] != 0;
   levels.pieces = sizes[level_pieces];
+  levels.piece_packs = sizes[level_piece_packs];
   return levels;
 }
 

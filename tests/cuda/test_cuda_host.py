@@ -18,7 +18,7 @@ from torchpd.scene.pins import hold_exactly
 
 require_gpu()
 
-OUTER = ("lbfgs", "momentum", "corotated")  # of Multilevel, which has a kernel of its own
+OUTER = ("lbfgs", "momentum")  # of Multilevel, which has a kernel of its own
 Calls = dict[str, Callable[[], Any]]
 
 

@@ -21,7 +21,7 @@ from torchpd.plan.placement import step_bytes
 
 require_gpu()
 
-SOLVERS = ("corotated", "lbfgs", "momentum")
+SOLVERS = ("lbfgs", "momentum")
 
 
 def body(contacts: bool, cells: tuple[int, int, int] = (8, 3, 3)) -> Case:

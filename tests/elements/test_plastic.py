@@ -174,7 +174,7 @@ def test_bits_do_not_depend_on_the_batch(dtype: torch.dtype) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:Simulator. .* are inverted or flat")
-@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Jacobi(), pd.Multilevel("lbfgs")])
+@pytest.mark.parametrize("solver", [pd.Chebyshev(), pd.Jacobi(), pd.Multilevel()])
 @pytest.mark.parametrize("start", ["random", "collapsed", "mirrored", "stretched"])
 def test_hard_starts_come_down(start: str, solver: Any) -> None:
     """The objective of a step after flow falls from iterates far away."""
@@ -238,7 +238,7 @@ ROWS = ("plastic_youngs", "plastic_poisson", "yield_strain", "hardening", "creep
 
 def small() -> pd.Simulator:
     sim, _ = bar(iterations=2500, hardening=0.2, creep_time=0.05)
-    sim.solver = pd.Multilevel("lbfgs")
+    sim.solver = pd.Multilevel()
     sim.iterations = 300
     return sim
 

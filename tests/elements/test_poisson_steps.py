@@ -94,7 +94,7 @@ def test_environments_of_unlike_poisson_ratios() -> None:
 
 @pytest.mark.parametrize(
     ("solver", "known"),
-    [(pd.Chebyshev(), KNOWN_CHEBYSHEV), (pd.Multilevel("lbfgs"), KNOWN_LBFGS)],
+    [(pd.Chebyshev(), KNOWN_CHEBYSHEV), (pd.Multilevel(), KNOWN_LBFGS)],
     ids=["chebyshev", "lbfgs"],
 )
 def test_iterations(solver: Solver, known: dict[tuple[float, float], tuple[int, int, int]]) -> None:

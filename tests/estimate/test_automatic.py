@@ -112,12 +112,6 @@ def test_costs_decide(monkeypatch: pytest.MonkeyPatch) -> None:
     assert isinstance(beam(1e4).solver, pd.Multilevel)
 
 
-@pytest.mark.parametrize(("youngs", "outer"), [(1e4, "lbfgs"), (1e6, "corotated")])
-def test_short_steps_do_without_the_small_problem(youngs: float, outer: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    set_costs(monkeypatch, Cost(1.0, 1.0), Cost(1.0, 1.0))
-    assert beam(youngs).solver == pd.Multilevel(outer)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("multiprocessors", [20, 132, 170])
 def test_multilevel_costs_more_than_chebyshev_everywhere(
     multiprocessors: int, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
@@ -316,7 +310,7 @@ def test_on_the_cpu_the_batch_changes_nothing(youngs: float) -> None:
 def test_print_says_why_and_any_other_solver_ends_it() -> None:
     sim = beam(1e6)
     text = repr(sim)
-    assert "solver: Multilevel corotated" in text
+    assert "solver: Multilevel lbfgs" in text
     assert (
         "chosen because about 374 iterations of Chebyshev reach 0.001, or about 19 of Multilevel, each as long as 3.8"
         in text

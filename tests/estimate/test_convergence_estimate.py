@@ -138,8 +138,8 @@ def test_contacts_are_expected_to_take_multilevel_two_roots_of_what_chebyshev_ta
     assert needed(pd.Chebyshev(), smooth, rough) == plain
     # their relaxations differ
     for solver, contact in (
-        (pd.Multilevel("lbfgs"), smooth),
-        (pd.Multilevel("lbfgs"), rough),
+        (pd.Multilevel("momentum"), smooth),
+        (pd.Multilevel("momentum"), rough),
         (pd.Multilevel(), rough),
     ):
         assert needed(solver, contact) == pytest.approx(plain, rel=0.05)

@@ -88,7 +88,7 @@ def test_errors_are_against_the_minimum_that_the_default_reaches(scenes: Any) ->
         return exact.position_error((sim(state).velocities[0] * sim.time_step).numpy())
 
     assert error(pd.Chebyshev(), 3000) < 1e-6
-    assert error(pd.Multilevel("lbfgs"), 400) > 1e-2
+    assert error(pd.Multilevel(), 400) > 1e-2
 
 
 def test_the_description_says_that_buckling_takes_more(scenes: Any) -> None:

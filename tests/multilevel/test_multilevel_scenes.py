@@ -362,7 +362,7 @@ def test_meta_is_refused() -> None:
 def test_print_says_what_it_prepared() -> None:
     text = str(simulate(torch.float32, solver=pd.Multilevel()))
     for fact in (
-        "Multilevel corotated: 12 iterations, relaxation 1.8",
+        "Multilevel lbfgs: 12 iterations, relaxation 1.8",
         "preconditioner: 45 vertices > ",
         "solved directly",
     ):

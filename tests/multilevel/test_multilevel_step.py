@@ -47,20 +47,20 @@ def solved_beam() -> Array:
 @pytest.mark.parametrize(("youngs", "counts"), [(1e6, [16, 22, 42]), (1e8, [24, 42, 50])])
 def test_iterations_on_the_box(youngs: float, counts: list[int], device: torch.device) -> None:
     case = swing(11, youngs)
-    sim = simulator(case, torch.float64, device, solver=pd.Multilevel("lbfgs"))
+    sim = simulator(case, torch.float64, device, solver=pd.Multilevel())
     found = errors(sim, case, converged(case), counts)
     assert [error <= goal for error, goal in zip(found, (1e-2, 1e-3, 1e-4), strict=True)] == [True] * 3, found
 
 
 def test_swinging_beam(dtype: torch.dtype, device: torch.device) -> None:
     case = beam(1e6)
-    sim = simulator(case, dtype, device, solver=pd.Multilevel("lbfgs"))
+    sim = simulator(case, dtype, device, solver=pd.Multilevel())
     assert errors(sim, case, solved_beam(), [40])[0] <= 1e-3
 
 
 def test_twisted_beam(dtype: torch.dtype, device: torch.device) -> None:
     case = twist(5, 1e6)
-    sim = simulator(case, dtype, device, solver=pd.Multilevel("lbfgs"))
+    sim = simulator(case, dtype, device, solver=pd.Multilevel())
     # a quarter turn in one step: trials may fail while pieces find their rotation
     u, _ = run(sim, case, 40)
     assert relative_error(u, converged(case), case.problem().first_iterate()) <= 1e-3
@@ -69,7 +69,7 @@ def test_twisted_beam(dtype: torch.dtype, device: torch.device) -> None:
 def test_float32_reaches_its_floor(device: torch.device) -> None:
     """|u| is rounded by 6e-8 a number and M A >= 0.6 there: 1e-5 leaves room for the 26 elements between the ends."""
     case = beam(1e6)
-    sim = simulator(case, torch.float32, device, solver=pd.Multilevel("lbfgs"))
+    sim = simulator(case, torch.float32, device, solver=pd.Multilevel())
     u, _ = run(sim, case, 120)
     assert relative_error(u, solved_beam(), case.problem().first_iterate("inertial")) <= 1e-5
 
@@ -90,7 +90,7 @@ def test_momentum_needs_no_pairs(device: torch.device) -> None:
 def test_irregular_meshes_with_random_stiffness(name: str, device: torch.device) -> None:
     case = slivers() if name == "slivers" else irregular()
     solution = converged(case)
-    sim = simulator(case, torch.float64, device, solver=pd.Multilevel("lbfgs"))
+    sim = simulator(case, torch.float64, device, solver=pd.Multilevel())
     assert errors(sim, case, solution, [40])[0] <= 1e-4
     sim.solver = pd.Chebyshev()
     u, _ = run(sim, case, 160)
@@ -100,10 +100,10 @@ def test_irregular_meshes_with_random_stiffness(name: str, device: torch.device)
 def test_iterates_are_those_of_the_reference(dtype: torch.dtype, device: torch.device) -> None:
     """Textbook L-BFGS with M from its tables, beyond the ten iterations after which pairs are dropped."""
     case = slivers()
-    sim = simulator(case, dtype, device, solver=pd.Multilevel("lbfgs"))
+    sim = simulator(case, dtype, device, solver=pd.Multilevel())
     problem = case.problem()
     first = problem.first_iterate(case.start)
-    tables = Tables(simulator(case, torch.float64, device, solver=pd.Multilevel("lbfgs")).plan.to("cpu"))
+    tables = Tables(simulator(case, torch.float64, device, solver=pd.Multilevel()).plan.to("cpu"))
     expected = preconditioned_lbfgs(problem, first, tables, iterations=12)
     u, info = run(sim, case, 12)
     assert int(info.restarts) == 0
@@ -141,7 +141,7 @@ def test_free_body_keeps_its_momentum(dtype: torch.dtype, device: torch.device) 
     spin = np.cross([0.0, 0.0, 5.0], case.positions - case.positions.mean(axis=0))
     case = Case(case.scene, case.positions, case.velocities + spin, case.time_step)
     for iterations in (3, 30):
-        sim = simulator(case, dtype, device, solver=pd.Multilevel("lbfgs"), iterations=iterations)
+        sim = simulator(case, dtype, device, solver=pd.Multilevel(), iterations=iterations)
         masses = sim.masses.detach().double().cpu()[:, None]
         track = sim.rollout(state_of(case, sim), 5)
         before = (masses * torch.tensor(case.velocities)).sum(0)
@@ -176,7 +176,7 @@ def test_tolerance_stops_each_environment_by_itself(outer: str, batch: int, dire
 def test_no_iterations_leave_the_first_iterate(dtype: torch.dtype, device: torch.device) -> None:
     case = beam(1e5)
     states = []
-    for solver in (pd.Chebyshev(), pd.Multilevel("lbfgs")):
+    for solver in (pd.Chebyshev(), pd.Multilevel()):
         sim = simulator(case, dtype, device, solver=solver, iterations=0)
         states.append(sim(state_of(case, sim)))
     assert torch.equal(states[0].positions, states[1].positions)

@@ -13,7 +13,7 @@ import pytest
 import torch
 from cases import Case, box, rotation
 from mixed_scenes import CASES
-from multilevel_cases import Tables, swing
+from multilevel_cases import Tables, slabs, swing
 from numpy.typing import NDArray
 from programs import ROOT
 from runs import simulator
@@ -49,16 +49,6 @@ def pairs(benchmarks: None) -> ModuleType:
     import coarse_pairs
 
     return coarse_pairs
-
-
-def slabs() -> Case:
-    """The swinging beam of 25 x 5 x 5 cells, 1e4 and 1e8 Pa in turn along it, every two cells."""
-    case = swing(5, 1e4)
-    vertices, tets = box((1.0, 0.2, 0.2), (25, 5, 5))
-    cell = np.floor(25.0 * vertices[tets].mean(axis=1)[:, 0]).astype(np.int64)
-    body = pd.Solid(pd.TetMesh(vertices, tets), np.where(cell // 2 % 2 == 1, 1e8, 1e4), density=1000.0)
-    scene = pd.Scene(body, pd.Pin(body, vertices[:, 0] == 0.0), pd.Gravity((0.0, -9.8, 0.0)))
-    return replace(case, scene=scene)
 
 
 class Swing(NamedTuple):

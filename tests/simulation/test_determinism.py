@@ -42,7 +42,7 @@ def test_an_item_does_not_feel_its_batch(
 
 @pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(("column", "sick"), [(1, 1e12), (2, np.inf), (2, np.nan)])
-@pytest.mark.parametrize("outer", ["corotated", "lbfgs", "momentum"])
+@pytest.mark.parametrize("outer", ["lbfgs", "momentum"])
 @pytest.mark.parametrize("batch", [3, 17])
 def test_environments_do_not_feel_one_that_is_lost(
     batch: int, outer: Any, column: int, sick: float, dtype: torch.dtype, device: torch.device

@@ -108,7 +108,7 @@ def test_a_rollout_takes_the_forces_of_every_step() -> None:
 
 def test_gradients_by_differences() -> None:
     """Through two steps: of states, pressures and wind. Differences are exact to 3e-7, by size^2 and by rounding."""
-    case = Loaded(torch.float64, iterations=400, solver=pd.Multilevel("lbfgs"))
+    case = Loaded(torch.float64, iterations=400, solver=pd.Multilevel())
     sim, start = case.sim, case.state()
     inputs = [
         start.positions,
@@ -242,7 +242,7 @@ def test_a_falling_sheet_reaches_its_terminal_velocity() -> None:
 
 def test_the_converged_step_has_the_loads() -> None:
     """In the reference of errors, with targets, and in `tune`."""
-    case = Loaded(torch.float64, solver=pd.Multilevel("lbfgs"), iterations=100)
+    case = Loaded(torch.float64, solver=pd.Multilevel(), iterations=100)
     sim, targets = case.sim, case.targets()
     sim.set_material(friction=0.0)
     state = case.state()

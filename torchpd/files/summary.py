@@ -102,7 +102,7 @@ def _preconditioner_lines(sim: Stepper) -> list[str]:
     if not has_preconditioner(plan.arrays):
         return []
     whose = "" if isinstance(sim.solver, Multilevel) else " of gradients"
-    _, _, nodes, _, _, below, direct, _ = plan.level_sizes.tolist()
+    _, _, nodes, _, _, below, direct, *_ = plan.level_sizes.tolist()
     steps = [f"{plan.vertices} vertices", *(f"{count} nodes" for count in (nodes, below) if count)]
     solved = "solved directly" if direct else "the last solved directly"
     own = sum(array.numel() * array.element_size() for array in plan.arrays[-len(MULTILEVEL_TABLE) :])
@@ -252,7 +252,7 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     if solver.outer == "momentum":
         return real * numbers
     # the coarse space: two vectors, and two dense matrices of all pieces
-    pieces = int(plan.level_sizes[-1])
+    pieces = int(plan.level_sizes[-2])
     return real * (numbers + 8 * plan.vertices) + 8 * 2 * (_MODES * pieces) ** 2
 
 

@@ -124,6 +124,8 @@ def precondition_plan(
         )  # fmt: skip
     if plan.kernel is not None:
         arrays["coarse_columns"] = _by_columns(arrays["coarse_factor"])
+    else:
+        arrays |= _pack_tets(plan, arrays)
     levels = (
         tensor_of(arrays[row.name]).to(
             # `sizes` stay on the host, which must not wait for a device
@@ -140,3 +142,28 @@ def _by_columns(packed: NDArray[np.float64]) -> NDArray[np.float64]:
     size = int(np.sqrt(2 * len(packed)))
     column, row = np.triu_indices(size)
     return np.asarray(packed[row * (row + 1) // 2 + column])
+
+
+_LANES = 16  # of a pack, as in csrc/views/multilevel.def
+
+
+def _pack_tets(plan: Plan, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Packs of the tetrahedra that pieces move, patch by patch, those that the same pieces move together."""
+    of, weight = (arrays[name].reshape(-1, 4) for name in ("piece_of", "piece_weight"))
+    moved = np.bitwise_or.reduce(np.where(weight > 0.0, np.uint64(1) << of.astype(np.uint64), np.uint64(0)), axis=1)
+    blocks = plan.patch_block.numpy()
+    patch = np.repeat(np.arange(len(blocks) - 1), np.diff(blocks))
+    slots = plan.tet_corner.numpy().reshape(-1, 4, _LANES) + plan.patch_slot.numpy()[patch, None, None]
+    pieces = np.bitwise_or.reduce(moved[plan.slot_vertex.numpy()[slots]], axis=1).reshape(-1)
+    place = np.flatnonzero((pieces != 0) & (plan.tet_volume.numpy().reshape(-1) > 0.0))
+    place = place[np.lexsort((place, pieces[place], patch[place // _LANES]))]
+    own = patch[place // _LANES]
+    counts = np.bincount(own, minlength=len(blocks) - 1)
+    packs = -(-counts // _LANES)
+    first = _LANES * (np.cumsum(packs) - packs)
+    tets = np.full(_LANES * int(packs.sum()), -1, np.int32)
+    tets[first[own] + np.arange(len(own)) - (np.cumsum(counts) - counts)[own]] = place
+    sizes = arrays["level_sizes"].copy()
+    sizes[-1] = packs.sum()
+    patches = np.repeat(np.arange(len(packs), dtype=np.int32), packs)
+    return {"level_sizes": sizes, "piece_pack_patch": patches, "piece_pack_tet": tets.reshape(-1, _LANES)}

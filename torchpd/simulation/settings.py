@@ -18,7 +18,7 @@ from ..estimate.solver_choice import Choice, choose_solver, warn_of_few_iteratio
 from ..plan.compiled import CompiledScene
 from ..plan.kernel_choice import check_kernel
 from ..plan.placement import is_suitable, move_plan, plan_for_device, plan_for_solver, recompile_plan
-from ..scene.solvers import Chebyshev, Multilevel, Solver, check_solver
+from ..scene.solvers import Chebyshev, Solver, check_solver
 from .state_checks import check_adjoint, check_batch
 
 __all__ = [

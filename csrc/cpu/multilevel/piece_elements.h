@@ -7,12 +7,12 @@
 namespace pd::inline PD_TARGET {
 
 // Adds what the pieces of a patch have in common, pack by pack. A pack has the pieces of all its lanes; weights are zero elsewhere.
+// Tetrahedra that the same pieces move share their packs.
 template <class T, class Work>
 class PieceElements {
   using R = Pack<T, native_width<T>>;
   using Slots = typename Work::Slots;
   using Block = typename Work::Block;
-  static constexpr int tet_numbers = 6;
 
  public:
   PieceElements(const Plan<T>& plan, const Work& work, const Slots& slots,
@@ -29,17 +29,18 @@ class PieceElements {
   template <class Position, class Shift, class Moves>
   void add(int patch, const Position& position, const Shift& shift_of, const Moves& moves) {
     mask_ = work_.patches.mask[patch];
-    if (count_pieces(mask_) < 2) return clear(patch);
     read_slots(patch, position, moves);
     each_piece(mask_, [&](int rank, int piece) { shift_[rank] = shift_of(piece); });
     const int pairs = piece_pair(count_pieces(mask_), 0);
     for (int n = 0; n < pairs * piece_block; ++n) slots_.sums[n] = R(T(0));
     const Quad<T>* const fields[1] = {slots_.position.begin()};
-    LaneSums<Single<T>> unused;
-    const ElementsAcross<1, T> tets(plan_, fields, weights_, nullptr, unused);
-    each_element(plan_, patch, tets,
-                 one_by_one([&](const auto& pack, int s) { add_tets(pack, s); }));
+    for (int pack = work_.first_pack[patch]; pack < work_.first_pack[patch + 1]; ++pack) {
+      const int32* tets = plan_.levels.piece_pack_tet + std::int64_t(pack) * block_lanes;
+      for (int lane = 0; lane < block_lanes && tets[lane] >= 0; lane += R::width)
+        add_tets(Tets(plan_, weights_, tets + lane));
+    }
     if (plan_.stencil_blocks) {
+      LaneSums<Single<T>> unused;
       each_stencil<Single<T>>(plan_, patch, [&](auto kind, const StencilPart<T>& part) {
         using Kind = decltype(kind);
         if (dissipates<Kind> && !dissipates_too_) return;
@@ -55,11 +56,6 @@ class PieceElements {
   }
 
  private:
-  void clear(int patch) const {
-    for (std::int64_t p = work_.patches.pair[patch]; p < work_.patches.pair[patch + 1]; ++p)
-      work_.strains[p] = Block{};
-  }
-
   template <class Position, class Moves>
   void read_slots(int patch, const Position& position, const Moves& moves) const {
     const int first = plan_.patch_slot[patch], count = plan_.patch_slot[patch + 1] - first;
@@ -75,7 +71,7 @@ class PieceElements {
     }
   }
 
-  // The pieces of a pack, by their ranks in the patch; none where one piece moves all of it.
+  // The pieces of a pack, by their ranks in the patch.
   template <int Corners, class Part>
   int find_pieces(const Part& part) {
     PieceMask mask = 0;
@@ -83,7 +79,6 @@ class PieceElements {
       const int16* corner = part.corner(c);
       for (int lane = 0; lane < R::width; ++lane) mask |= slots_.mask[corner[lane]];
     }
-    if (count_pieces(mask) < 2) return 0;
     each_piece(mask, [&](int n, int piece) { rank_[n] = rank_of(mask_, piece); });
     return count_pieces(mask);
   }
@@ -101,26 +96,44 @@ class PieceElements {
     }
   }
 
-  template <class Elements>
-  void add_tets(const Elements& elements, int s) {
-    const auto part = elements.part(s);
-    const int pieces = find_pieces<4>(part);
-    if (pieces == 0) return;
+  // The tetrahedra of a pack; lanes without any repeat the first one, with no weight.
+  struct Tets {
+    int16 slot[4][R::width];
+    Mat3<R> inverse;
+    R weight, pressure;
+
+    Tets(const Plan<T>& plan, const ElementWeights<T>& weights, const int32* tets)
+        : pressure(T(0)) {
+      R number[6];
+      for (int lane = 0; lane < R::width; ++lane) {
+        const int tet = tets[lane] < 0 ? tets[0] : tets[lane];
+        const BlockPart<T> part{&plan, tet / block_lanes, tet % block_lanes};
+        for (int c = 0; c < 4; ++c) slot[c][lane] = *part.corner(c);
+        for (int n = 0; n < 6; ++n) number[n].v[lane] = *part.rest(n);
+        weight.v[lane] = tets[lane] < 0 ? T(0) : weights.weight[tet];
+        if (weights.pressure) pressure.v[lane] = tets[lane] < 0 ? T(0) : weights.pressure[tet];
+      }
+      inverse = read_rest<R>([&](int n) { return number[n]; }).inverse(0);
+    }
+    const int16* corner(int c) const { return slot[c]; }
+  };
+
+  void add_tets(const Tets& tets) {
+    const int pieces = find_pieces<4>(tets);
     Vec3<R> x[4], arm[4];
     R share[4];
-    elements.corners(s, 0, x);
-    const Mat3<R> inverse = elements.rest(s).inverse(0);
-    const Mat3<R> back = transpose(nearest_rotation(deformation_gradient(x, inverse)));
+    for (int c = 0; c < 4; ++c)
+      x[c] = gather_corner<T, R::width>(slots_.position.begin(), tets.slot[c]);
+    const Mat3<R> back = transpose(nearest_rotation(deformation_gradient(x, tets.inverse)));
     auto* strains = reinterpret_cast<PieceStrain<R>*>(slots_.strains.begin());
     for (int k = 0; k < pieces; ++k) {
-      read_piece(part, x, rank_[k], arm, share);
-      strains[k] = PieceStrain<R>(inverse, back, arm, share);
+      read_piece(tets, x, rank_[k], arm, share);
+      strains[k] = PieceStrain<R>(tets.inverse, back, arm, share);
     }
-    const R weight = elements.weight(s);
-    if (elements.weights.pressure) {
-      add_strains<true>(strains, pieces, weight, elements.pressure(s));
+    if (weights_.pressure) {
+      add_strains<true>(strains, pieces, tets.weight, tets.pressure);
     } else {
-      add_strains<false>(strains, pieces, weight, R(T(0)));
+      add_strains<false>(strains, pieces, tets.weight, tets.pressure);
     }
   }
 
@@ -155,7 +168,6 @@ class PieceElements {
     constexpr int n = Kind::corners, rows = 3 * Kind::dims;
     using Change = R[piece_modes][rows];
     const int pieces = find_pieces<n>(stencils.part);
-    if (pieces == 0) return;
     const StencilNumbers<Kind, Stencils> own(stencils);
     Vec3<R> x[n], arm[n], f[Kind::dims];
     R share[n], second[rows][rows];

@@ -89,6 +89,7 @@ struct PiecesWork {
 
   int pieces, unknowns;
   std::vector<PieceMask> vertex;  // [vertices]
+  std::vector<int> first_pack;    // [patches + 1] of tetrahedra
   PieceParts patches, chunks;     // those of a chunk: of its rows of A
   Row<Value> arm;                 // [vertices] positions from the middle
   Row<Value> field;               // [vertices] Z q, and A times that
@@ -152,7 +153,10 @@ struct PiecesWork {
     vertex.assign(plan.vertices, 0);
     for (std::int64_t i = 0; i < plan.vertices; ++i)
       each_share(levels, i, [&](int, int piece, T) { vertex[i] |= PieceMask(1) << piece; });
+    first_pack.assign(plan.patches + 1, 0);
+    for (int pack = 0; pack < levels.piece_packs; ++pack) ++first_pack[levels.piece_pack_patch[pack] + 1];
     for (int patch = 0; patch < plan.patches; ++patch) {
+      first_pack[patch + 1] += first_pack[patch];
       PieceMask mask = 0;
       for (int s = plan.patch_slot[patch]; s < plan.patch_slot[patch + 1]; ++s)
         mask |= vertex[plan.slot_vertex[s]];

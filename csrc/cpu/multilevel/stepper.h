@@ -53,7 +53,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       const bool has_friction = Lanes::lane(friction, lane) > 0;
-      search_[lane].begin(mismatch_[lane], HasContacts, has_friction, has_space_, energy_noise<T>(),
+      search_[lane].begin(mismatch_[lane], HasContacts, has_friction, lbfgs_, energy_noise<T>(),
                           this->stop_[lane].free_fall);
       pairs_[lane] = {};
       made_[lane] = holds_[lane] = false;
@@ -93,7 +93,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
       }
       const double work = search_[lane].known ? Lanes::lane(sum.first, lane) : 0;
       const double energy = Lanes::lane(sum.energy, lane) + work;
-      const bool accepted = search_[lane].accept(energy, work, lbfgs_);
+      const bool accepted = search_[lane].accept(energy, work);
       Lanes::set_lane(accepted_, lane, T(accepted ? 1 : 0));
       Lanes::set_lane(finite_, lane, T(energy < HUGE_VAL ? 1 : 0));
     }
@@ -152,7 +152,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
         pairs.product[j][newest_] = total[j];
         pairs.s_dot_g[j] = total[history + j];
       }
-      const bool teaches = k > 0 && search_[lane].updates_pairs();
+      const bool teaches = k > 0 && search_[lane].accepted;
       pairs.admit(newest_, teaches, total[newest_], total[2 * history], total[2 * history + 2]);
       if (search_[lane].clears_pairs()) pairs.clear();
       pairs.first_loop(newest_);
@@ -202,7 +202,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
     for (int lane = 0; lane < width; ++lane) {
       LineSearch& search = search_[lane];
       const bool goes = !done_[lane], falls_back = goes && (search.plain_jacobi || search.jacobi);
-      const double b = goes ? search.propose(schedule_[lane].limit, lbfgs_, made_[lane],
+      const double b = goes ? search.propose(schedule_[lane].limit, made_[lane],
                                              has_space_ && !made_[lane], is_held(lane))
                             : 0;
       Lanes::set_lane(beta, lane, T(b));

@@ -90,7 +90,7 @@ struct MultilevelLaunch {
       : kernel(kernel_of(step)),
         threads(is_small(step) ? small_multilevel_threads : multilevel_threads),
         shared(pass_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries, 2)) {
-    if (step.settings.schedule == ScheduleKind::corotated) add_corotation();
+    if (step.settings.learns()) add_corotation();
     resident = blocks_with(shared);
     keep_cycle(step);
     if (resident == 0) refuse_shared_memory(shared);
@@ -161,7 +161,7 @@ MultilevelMemory<T> arrange(Arena& arena, const MultilevelCall<T>& call) {
   const DeviceStep<T>& step = call.stream.step;
   const std::int64_t teams = call.teams, n = step.plan.vertices;
   const std::int64_t pairs = step.settings.learns() ? history * n : 0;
-  const std::int64_t small = step.settings.schedule == ScheduleKind::corotated ? teams : 0;
+  const std::int64_t small = step.settings.learns() ? teams : 0;
   const std::int64_t held = has_contacts(step) ? n : 0;
   MultilevelMemory<T> m;
   // zero-initialised arrays come first

@@ -33,7 +33,7 @@ class MultilevelRunner {
     outliers_ = {mismatch.has_outliers, T(mismatch.trusted)};
     if (threadIdx.x == 0) {
       const bool stops = w_.settings().tolerance > 0;
-      c_.outer.begin(mismatch, HasContacts, w_.contacts.friction() > T(0), corotates_,
+      c_.outer.begin(mismatch, HasContacts, w_.contacts.friction() > T(0), lbfgs_,
                      energy_noise<T>(), stops ? w_.progress.stop.free_fall : 0);
       c_.pairs = {};
       c_.done = false;
@@ -86,7 +86,7 @@ class MultilevelRunner {
     if (threadIdx.x == 0) {
       const double work = c_.outer.known ? c_.total[dots_energy + 1] + sum[1] : 0;
       const double energy = (c_.total[dots_energy] + sum[0]) + work;
-      c_.accepted = c_.outer.accept(energy, work, lbfgs_);
+      c_.accepted = c_.outer.accept(energy, work);
     }
     __syncthreads();
     const bool moves = c_.accepted;
@@ -120,7 +120,7 @@ class MultilevelRunner {
   PD_DEVICE void next_trial() {
     __syncthreads();
     if (threadIdx.x == 0)
-      c_.total[0] = c_.outer.propose(w_.progress.schedule.limit, lbfgs_, corotated_,
+      c_.total[0] = c_.outer.propose(w_.progress.schedule.limit, corotated_,
                                      corotates_ && builds_ == 0, has_contact_springs());
     ++used_;
     __syncthreads();
@@ -347,7 +347,7 @@ class MultilevelRunner {
     }
     if (j != 0) return;
     // s.y of c_.total: another lane has just written that of the table
-    pairs.admit(newest_, k > 0 && c_.outer.updates_pairs(), c_.total[dots_sy + newest_],
+    pairs.admit(newest_, k > 0 && c_.accepted, c_.total[dots_sy + newest_],
                 c_.total[dots_change], c_.total[dots_yy]);
     if (c_.outer.clears_pairs()) pairs.clear();
   }

@@ -5,22 +5,20 @@
 // material let s be the largest ratio of its inertias and stiffnesses to the reference. Then A <= s A_0, and theta M
 // / s descends.
 //
-// L-BFGS and momentum may overshoot, so every trial is accepted or rejected by its energy. After a few rejected
-// trials accelerated Jacobi iterations replace M; they descend by the proof there. With L-BFGS they end after some
-// iterations, since the pairs have learnt from the failures; with momentum they last for the rest of the step. The
-// number is 2, then 4, 8, and falls again after successes. With friction, and without the coarse problem, it is 8,
-// then 16, after one failure.
+// L-BFGS and momentum may overshoot, so every trial is accepted or rejected by its energy. L-BFGS shortens rejected
+// trials, and the next one starts as short; the pair of a rejected trial is not used, since it holds the curvature of
+// motions too large. After twelve of a step accelerated Jacobi iterations replace M; they descend by the proof there.
+// Their number is 2, then 4, 8, 16. With momentum they last for the rest of the step.
 //
 // Contacts block directions that A does not know of. M is applied to the residual along the free directions, and its
 // result is used along them. The diagonal serves the blocked ones (two-metric projection, Bertsekas 1982), and
 // vertices with a spring much stiffer than in M. Along the free directions M is far too soft for motions of whole
-// parts, by the ratio of stiffness to inertia. The coarse problem of solver/multilevel/deflation.h replaces these, with
+// parts, by the ratio of stiffness to inertia. The coarse space of solver/multilevel/pieces.h replaces these, with
 // contacts included.
 //
-// With the coarse problem trials of a landing body fail for another reason. The direction is good until it moves a
-// stiff face into a contact that is not active yet, and bends it there. So trials are shortened, to a thousandth and
-// less where a face hovers within micrometres, and the next one starts as short. Where that fails too, short Jacobi
-// fallbacks follow; with friction they come first, since unsettled normal forces drag stiff bodies far astray.
+// Trials of a landing body fail because the direction is good until it moves a stiff face into a contact that is not
+// active yet, and bends it there. A thousandth and less of it is left where a face hovers within micrometres. With
+// friction Jacobi fallbacks come first, since unsettled normal forces drag stiff bodies far astray.
 //
 // Friction is Coulomb's with the normal force at the iterate. Within an iteration it has an energy, its bound times
 // the slip, whose work enters the acceptance test. Its force along the slip is part of the residual. A trial ends

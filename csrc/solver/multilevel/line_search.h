@@ -8,19 +8,16 @@
 
 namespace pd::inline PD_TARGET {
 
-// iterations of the first Jacobi fallback, and of one with friction
-constexpr int fallback_length = 2, friction_fallback_length = 8;
-constexpr int most_doublings = 7;            // of these lengths
-constexpr int failures_before_fallback = 4;  // failed trials before a fallback
 constexpr double armijo_factor = 1e-4;  // share of the decrease that the slope predicts (Armijo)
-
-// With contacts and a coarse problem trials are shortened:
-constexpr double step_reduction = 0.25;      // factor of the step length after a failed trial
+// factor of the step length after a failed trial: a body that lands has contacts within micrometres
+constexpr double step_reduction = 0.5, contact_step_reduction = 0.25;
 constexpr int failures_before_clearing = 2;  // failed trials before L-BFGS restarts
-constexpr int most_reductions = 12;          // before a fallback, which is 2, 4, 8, 16 iterations
-constexpr int most_contact_doublings = 3;
+constexpr int most_reductions = 12;          // before a fallback of Jacobi iterations
+constexpr int fallback_length = 2, most_doublings = 3;  // of the first fallback; of that length
+constexpr int friction_fallback_length = 8;             // of every one with friction
 constexpr int unsettled_fallbacks = 3,
               unsettled_failures = 2;  // with friction the first fallbacks come earlier
+constexpr int failures_before_plain = 4;  // failed accelerated iterations before a plain one
 // Without contacts the coarse problem is rebuilt after so many trials in a row that lowered E by less than this share of what the
 // slope promises, half of it at full length: then H has changed.
 constexpr double slow_share = 0.75;
@@ -55,18 +52,17 @@ struct LineSearch {
   double slack = 0;
   int failures = 0, restarts = 0, momentum = 0;
   double material_fit = 1;  // least share of the error that M changes under material mismatch
+  bool learns = false, touches = false;  // L-BFGS; there are contacts
   // of the current trial: its weight if it is a Jacobi iteration; else 0, and its error share
   double omega = 0;
   ErrorShare share;
   StoppingTest stop;
-  int fallback_left = 0, doublings = 0;  // iterations left of a fallback; doublings of its length
+  int fallback_left = 0;  // iterations left of a fallback
   bool plain_jacobi = false, accepted = true, known = false;
   bool friction = false;
   // accelerated Jacobi iterations: to the end of the step with momentum, during a fallback with L-BFGS
   bool jacobi = false;
-  // whether trials are shortened; the step length without failures, the number of reductions, and the fallbacks of
-  // the step
-  bool shortens = false;
+  // the step length without failures, the number of reductions, and the fallbacks of the step
   double step_length = 1;
   int reductions = 0, fallbacks = 0;
   // path length of accepted trials: in all, and since the coarse problem was built
@@ -75,16 +71,9 @@ struct LineSearch {
 
   // step length of the next trial
   PD_HD double trial_length() const {
-    if (shortens) {
-      // the first failure at full length only teaches L-BFGS; the trial is repeated at full length
-      double shortened = step_length;
-      for (int i = step_length < 1 ? 0 : 1; i < failures; ++i) shortened *= step_reduction;
-      return shortened;
-    }
-    const int halvings = failures < failures_before_fallback
-                             ? failures - 1
-                             : failures_before_fallback - 1;  // more failures end in a fallback
-    return halvings > 0 ? 1.0 / double(1 << halvings) : 1.0;
+    double length = step_length;
+    for (int i = 0; learns && i < failures; ++i) length *= reduction();
+    return length;
   }
 
   // Weight of M in a step; `held`: the coarse problem includes contacts.
@@ -94,10 +83,10 @@ struct LineSearch {
 
   // Whether a trial of this energy is accepted; `work` is the part against friction. NaN is not, unless it is the
   // first trial.
-  PD_HD bool accept(double trial, double work, bool armijo) {
+  PD_HD bool accept(double trial, double work) {
     const double length_taken = trial_length();
     const bool preconditioned = !plain_jacobi && !jacobi;
-    const double demanded = armijo && preconditioned ? armijo_factor * length_taken * slope : 0;
+    const double demanded = learns && preconditioned ? armijo_factor * length_taken * slope : 0;
     if (preconditioned) judge(trial, length_taken);
     const bool decreased = !known || trial <= energy - demanded + slack * absolute(energy);
     // friction has no energy: with it the Jacobi iteration is a fixed-point map, and continues
@@ -111,50 +100,37 @@ struct LineSearch {
       // the friction of another iterate does other work
       energy = trial - work;
     }
-    if (shortens && !jacobi) {
+    if (learns && !jacobi) {
       plain_jacobi = false;
       if (preconditioned) update_step_length(length_taken, repeated);
       return accepted;
     }
-    if (shortens) {
+    if (learns) {
       jacobi = --fallback_left > 0;
       // the momentum failed
       if (!jacobi) failures = 0;
-    } else if (!armijo) {
+    } else {
       // without momentum M alone descends, if it fits
       jacobi = jacobi || failures > 1;
-    } else if (!jacobi) {
-      if (failures >= (friction ? 1 : failures_before_fallback)) {
-        start_fallback();
-      } else if (decreased && !friction && doublings > 0) {
-        --doublings;
-      }
-    } else if (friction && !decreased) {
-      start_fallback();
-    } else if (decreased) {
-      // without friction only the momentum can fail here
-      jacobi = --fallback_left > 0;
     }
-    plain_jacobi = failures >= failures_before_fallback;
+    plain_jacobi = failures >= failures_before_plain;
     return accepted;
   }
 
-  // whether L-BFGS stores the pair of the last trial, and whether it clears all pairs
-  PD_HD bool updates_pairs() const {
-    return !shortens || accepted || (failures == 1 && step_length >= 1);
-  }
+  // whether L-BFGS clears all pairs; a trial that failed adds none
   PD_HD bool clears_pairs() const {
-    return plain_jacobi || jacobi || (shortens && failures == failures_before_clearing);
+    return plain_jacobi || jacobi || failures == failures_before_clearing;
   }
 
-  // `touches`: there are contacts; `corotates`: there is a coarse problem
-  PD_HD void begin(const MaterialMismatch& mismatch, bool touches, bool has_friction,
-                   bool corotates, double noise, double free_fall) {
+  // `has_contacts`: there are some; `by_lbfgs`: with the coarse problem, else by momentum
+  PD_HD void begin(const MaterialMismatch& mismatch, bool has_contacts, bool has_friction,
+                   bool by_lbfgs, double noise, double free_fall) {
     *this = {};
     scale = mismatch.scale;
     material_fit = mismatch.spread < 1 ? 1 - mismatch.spread : rotating_share;
     friction = has_friction;
-    shortens = touches && corotates;
+    learns = by_lbfgs;
+    touches = has_contacts;
     slack = noise;
     stop.free_fall = free_fall;
   }
@@ -170,7 +146,7 @@ struct LineSearch {
     return accepted && restarts > 0 && path_since_coarse > coarse_rebuild_share * path;
   }
   PD_HD bool is_outdated() const {
-    return shortens ? rebuilds_coarse() : slow >= slow_trials && path_since_coarse > 0;
+    return touches ? rebuilds_coarse() : slow >= slow_trials && path_since_coarse > 0;
   }
   PD_HD void rebuilt() {
     path_since_coarse = 0;
@@ -190,9 +166,9 @@ struct LineSearch {
   PD_HD bool accelerates() const { return jacobi && !plain_jacobi; }
 
   // Returns the momentum b of the next trial, which starts at u + b (u - before). `limit` is that of the Jacobi
-  // schedule; `learns` is true for L-BFGS. `corotated`: the direction has the coarse correction. `waits`: the coarse
+  // schedule. `corotated`: the direction has the coarse correction. `waits`: the coarse
   // problem is not built yet, and until then a rotating part may hardly move. `held`: it includes contacts.
-  PD_HD double propose(double limit, bool learns, bool corotated, bool waits, bool held) {
+  PD_HD double propose(double limit, bool corotated, bool waits, bool held) {
     const bool extrapolates = accelerates() || !(learns || plain_jacobi);
     const double b = extrapolates ? extrapolation(jacobi ? limit : momentum_limit()) : 0;
     omega = plain_jacobi || jacobi ? 1 + b : 0;
@@ -208,6 +184,8 @@ struct LineSearch {
   }
 
  private:
+  PD_HD double reduction() const { return touches ? contact_step_reduction : step_reduction; }
+
   // Counts trials that fell short of the model E - t g.d + t^2 / 2 g.d; rounding can judge none.
   PD_HD void judge(double trial, double length) {
     const double promised = slope * length * (1 - 0.5 * length);
@@ -233,7 +211,7 @@ struct LineSearch {
   PD_HD void update_step_length(double length_taken, bool repeated) {
     if (accepted) {
       step_length = repeated ? MaterialMismatch::larger(length_taken, least_step_length)
-                             : MaterialMismatch::smaller(1, length_taken / step_reduction);
+                             : MaterialMismatch::smaller(1, length_taken / reduction());
       return;
     }
     ++reductions;
@@ -243,14 +221,9 @@ struct LineSearch {
   }
 
   PD_HD void start_fallback() {
-    fallback_left = friction ? friction_fallback_length : fallback_length;
-    if (shortens) {
-      if (!friction)
-        fallback_left <<= fallbacks < most_contact_doublings ? fallbacks : most_contact_doublings;
-    } else {
-      fallback_left <<= doublings;
-      doublings += doublings < most_doublings;
-    }
+    fallback_left = friction ? friction_fallback_length
+                             : fallback_length << (fallbacks < most_doublings ? fallbacks
+                                                                               : most_doublings);
     ++fallbacks;
     jacobi = true;
     failures = reductions = 0;

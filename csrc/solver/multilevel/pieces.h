@@ -8,7 +8,7 @@
 // near to A^-1 on Z that iterations are as many, and nothing has to be summed up after M. There M comes times theta < 2.
 //
 // A vertex moves by the twists of up to four pieces with weights that add up to one, so pieces bend into each other. Z was taken at
-// the positions where Hc was made. Elements that only one piece moves are left out: no motion of Z strains them.
+// the positions where Hc was made. Turns to first order strain what is strained, within a piece too.
 //
 //   tetrahedra      V (2 mu |sym(dF R^T)|^2 + lambda tr(dF R^T)^2): linear elasticity in the frame of the element
 //   other kinds     dF^T K dF with their own second derivative K at F, its negative eigenvalues set to zero
