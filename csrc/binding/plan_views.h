@@ -46,10 +46,10 @@ constexpr int level_arrays = 0
 
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
-  std::int64_t level_size, element, vertex, device_vertex, piece_pack, fine_end, fine_entry, fine_prolongation,
-      host_fine_prolongation, device_fine_prolongation, fine_node_end, middle_end, middle_entry,
-      middle, middle_prolongation, host_middle_prolongation, device_middle_prolongation,
-      middle_node_end, coarse_entry, device_coarse_entry;
+  std::int64_t level_size, element, vertex, device_vertex, piece_pack, fine_end, fine_entry,
+      fine_prolongation, host_fine_prolongation, device_fine_prolongation, fine_node_end,
+      middle_end, middle_entry, middle, middle_prolongation, host_middle_prolongation,
+      device_middle_prolongation, middle_node_end, coarse_entry, device_coarse_entry;
 };
 
 #define X(name, type, width, rows, meaning) +1

@@ -50,7 +50,7 @@ def counts(case: Case, dtype: torch.dtype = torch.float64) -> list[int]:
     ("name", "most"),
     [
         ("swing", [7, 10, 13]),
-        ("stiff swing", [9, 13, 16]),
+        ("stiff swing", [9, 15, 20]),
         ("free", [6, 9, 12]),
         ("twist", [15, 18, 21]),
         ("octopus", [10, 15, 22]),
@@ -89,9 +89,9 @@ def pieces_of(plan: Plan) -> Pieces:
     return Pieces(main, shares)
 
 
-@pytest.mark.parametrize("poisson", [0.0, 0.4])
-def test_iterates_are_those_of_the_reference(poisson: float, dtype: torch.dtype) -> None:
-    case, iterations = swing(3, 1e6, poisson=poisson), 9
+@pytest.mark.parametrize(("poisson", "iterations"), [(0.0, 12), (0.4, 7)])
+def test_iterates_are_those_of_the_reference(poisson: float, iterations: int, dtype: torch.dtype) -> None:
+    case = swing(3, 1e6, poisson=poisson)
     problem = case.problem()
     sim = simulator(case, dtype, solver=pd.Multilevel(), iterations=iterations)
     tables = Tables(simulator(case, torch.float64, solver=pd.Multilevel()).plan)
@@ -167,7 +167,7 @@ def test_pieces_part_a_beam_across() -> None:
     assert not sums[held].any()
     assert pieces.weights.data.min() >= 0.09
     spans = [np.ptp(x[pieces.of == piece], axis=0).max() for piece in range(pieces.count)]
-    assert max(spans) <= 0.25  # of a metre
+    assert max(spans) <= 0.4  # of a metre
 
 
 def test_packs_hold_the_tetrahedra_that_the_same_pieces_move() -> None:

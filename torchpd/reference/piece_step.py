@@ -83,10 +83,10 @@ TRIALS = 2  # iterations in a row that fall short of it, after which the space i
 
 @dataclass
 class PieceCycle:
-    """The preconditioner M + Z (Hc^-1 - Ac^-1) Z^T / relaxation of L-BFGS, which multiplies it by the relaxation.
+    """The preconditioner M + Z (Hc^-1 / relaxation - Ac^-1) Z^T of L-BFGS, which multiplies it by the relaxation.
 
-    A is far too stiff for pieces that turn: it penalises every departure from the current rotations. For nu = 0 the sum
-    is at least M, because Hc <= Ac; else it takes at most 2 / 3 of Ac^-1 from 1.8 M. Before the iterate `first` it is
+    A is far too stiff for pieces that turn: it penalises every departure from the current rotations. The sum is
+    positive where M has 1 - 1 / relaxation of A^-1 on Z, because Hc <= Ac for nu = 0. Before the iterate `first` it is
     M alone; there Z, Hc and Ac are made. They are made anew after `TRIALS` iterations in a row that lowered E by less
     than `SLOW` of half the slope, which they would if H were still what it was. The secant pairs stay.
     """
@@ -114,12 +114,13 @@ class PieceCycle:
         if iteration == self.first or (self.remakes and self.made and self._slow >= TRIALS):
             space = PieceSpace(self.problem, thinned(self.pieces), displacement)
             noise = NOISE * np.diag(np.diag(space.matrix))
-            self._small = space, np.linalg.inv(space.hessian_alone + noise) - np.linalg.inv(space.matrix + noise)
+            soft, stiff = np.linalg.inv(space.hessian_alone + noise), np.linalg.inv(space.matrix + noise)
+            self._small = space, soft / self.relaxation - stiff
             self._slow, self.made = 0, self.made + 1
 
     def __call__(self, gradient: Array) -> Array:
         product = self.cycle(gradient)
         if self._small is not None:
             space, difference = self._small
-            product = product + space.prolong(difference @ space.restrict(gradient)) / self.relaxation
+            product = product + space.prolong(difference @ space.restrict(gradient))
         return product

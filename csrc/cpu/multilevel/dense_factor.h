@@ -81,7 +81,8 @@ class DenseFactor {
     int k = 0;
     for (; k + width <= end; k += width) {
       const Some x = Some::load(own + k);
-      for (int c = 0; c < together; ++c) part[c] = multiply_add(x, Some::load(other[c] + k), part[c]);
+      for (int c = 0; c < together; ++c)
+        part[c] = multiply_add(x, Some::load(other[c] + k), part[c]);
     }
     for (int c = 0; c < together; ++c) {
       sum[c] = 0;

@@ -44,8 +44,8 @@ class PieceElements {
       each_stencil<Single<T>>(plan_, patch, [&](auto kind, const StencilPart<T>& part) {
         using Kind = decltype(kind);
         if (dissipates<Kind> && !dissipates_too_) return;
-        add_stencils<Kind>(StencilsAcross<Kind, 1, Single<T>>{part, fields, numbers_, true, nullptr,
-                                                             unused});
+        add_stencils<Kind>(
+            StencilsAcross<Kind, 1, Single<T>>{part, fields, numbers_, true, nullptr, unused});
       });
     }
     for (int n = 0; n < pairs * piece_block; ++n) {

@@ -24,8 +24,8 @@ class PiecesOfTeam {
     PiecesMaker<Lanes>(plan_, team_, w_, work_).make(base, asks, scales);
   }
   // With contacts: the lanes that have it, where these leave the directions `free`.
-  void hold(const Mat3<Real>* free, const bool (&has)[width]) const {
-    PiecesMaker<Lanes>(plan_, team_, w_, work_).hold(free, has);
+  void hold(const Mat3<Real>* free, const bool (&has)[width], const double (&scales)[width]) const {
+    PiecesMaker<Lanes>(plan_, team_, w_, work_).hold(free, has, scales);
   }
   bool is_held(int lane) const { return there() && work_.factors[lane].held; }
 
@@ -53,9 +53,7 @@ class PiecesOfTeam {
   void after(Value* z, const bool (&around)[width], bool some, const Real& scale) const {
     if (some) {
       const Level<1, T> level = fine_level(plan_.levels);
-      each_vertex([&](std::int64_t i) {
-        work_.field[i] = row_product<Real>(level, z, int(i));
-      });
+      each_vertex([&](std::int64_t i) { work_.field[i] = row_product<Real>(level, z, int(i)); });
       restrict_to(work_.field.begin(), [](Factors& f) -> std::vector<double>& { return f.image; });
     }
     set_motion([&](int lane, const Factors& f, double* x) {
@@ -84,7 +82,8 @@ class PiecesOfTeam {
       Work::each_of_chunk(plan_.vertices, c, [&](std::int64_t i) {
         if (!any(none < w_.inverse[i])) return;
         const Vec3<Real> q = Lanes::vec3(moving(i, field[i]));
-        const Value push = Lanes::value(q), turn = Lanes::value(cross(Lanes::vec3(work_.arm[i]), q));
+        const Value push = Lanes::value(q),
+                    turn = Lanes::value(cross(Lanes::vec3(work_.arm[i]), q));
         Work::each_share(plan_.levels, i, [&](int, int piece, T weight) {
           Value* to = sum + 2 * rank_of(mask, piece);
           to[0] = multiply_add(Real(weight), push, to[0]);

@@ -42,13 +42,13 @@ class PiecesMaker {
     }
   }
 
-  // Contacts hold a vertex by springs as stiff as its diagonal, in the directions that they do not leave `free`.
-  void hold(const Mat3<Real>* free, const bool (&has)[width]) {
+  // Contacts hold vertices in the directions that they do not leave `free`; the others move on, against A times `scales`.
+  void hold(const Mat3<Real>* free, const bool (&has)[width], const double (&scales)[width]) {
     for (int lane = 0; lane < width; ++lane) {
       if (!has[lane]) continue;
       for (std::int64_t c = team_.begin(work_.chunks.count()); c < team_.end(work_.chunks.count());
            ++c)
-        add_springs(int(c), free, lane);
+        add_springs(int(c), free, lane, scales[lane]);
       team_.barrier();
       if (team_.rank == 0) factorise_held(lane);
       team_.barrier();
@@ -57,9 +57,7 @@ class PiecesMaker {
 
  private:
   // whether no pin of this step holds a vertex; what M holds moves with no piece
-  bool moves(std::int64_t i, int lane) const {
-    return Work::number(w_.inverse[i], lane) > 0;
-  }
+  bool moves(std::int64_t i, int lane) const { return Work::number(w_.inverse[i], lane) > 0; }
   Value moving(std::int64_t i, const Value& a) const {
     const Real none(T(0));
     return select(none < w_.inverse[i], a, Lanes::value({none, none, none}));
@@ -99,7 +97,7 @@ class PiecesMaker {
           if (!moves(i, lane)) continue;
           const Vec3<double> y = wide(work_.arm[i], lane);
           Work::each_share(levels_, i, [&](int, int piece, T weight) {
-            double(&s)[4] = sum[piece];
+            double (&s)[4] = sum[piece];
             s[0] += double(weight);
             s[1] += double(weight) * y.x;
             s[2] += double(weight) * y.y;
@@ -180,8 +178,7 @@ class PiecesMaker {
   }
 
   static void add_product(const Four& a, const Four& b, double (&sum)[4][4]) {
-    for (int m = 0; m < 4; ++m)
-      multiply_add(Four(a.v[m]), b, Four::load(sum[m])).store(sum[m]);
+    for (int m = 0; m < 4; ++m) multiply_add(Four(a.v[m]), b, Four::load(sum[m])).store(sum[m]);
   }
 
   void add_elements(const Value* base, int lane) const {
@@ -275,37 +272,42 @@ class PiecesMaker {
     }
   }
 
-  void add_springs(int chunk, const Mat3<Real>* free, int lane) const {
+  void add_springs(int chunk, const Mat3<Real>* free, int lane, double times) const {
     const PieceMask mask = work_.chunks.mask[chunk];
     Block* to = &work_.springs[work_.chunks.pair[chunk]];
     std::fill_n(to, work_.chunks.pair[chunk + 1] - work_.chunks.pair[chunk], Block{});
+    // hardly any vertex is held in any lane
+    const auto held = [&](std::int64_t i) { return !leaves_all(free[i]) && moves(i, lane); };
     Work::each_of_chunk(plan_.vertices, chunk, [&](std::int64_t i) {
-      // hardly any vertex is held in any lane
-      if (leaves_all(free[i]) || !moves(i, lane)) return;
-      Vec3<double> held[3];  // I - free
-      for (int a = 0; a < 3; ++a) {
-        const Vec3<Real>& row = free[i].row[a];
-        held[a] = {(a == 0) - Work::number(row.x, lane), (a == 1) - Work::number(row.y, lane),
-                   (a == 2) - Work::number(row.z, lane)};
-      }
-      const double stiffness = 1 / Work::number(w_.inverse[i], lane);
-      Work::each_share(levels_, i, [&](int, int p, T weight) {
-        Vec3<double> own[piece_modes], other[piece_modes];
-        held_modes(i, p, double(weight) * stiffness, held, lane, own);
-        Work::each_share(levels_, i, [&](int, int q, T share) {
-          const int row = rank_of(mask, p), column = rank_of(mask, q);
-          if (column > row) return;
-          held_modes(i, q, double(share), held, lane, other);
-          Block& block = to[piece_pair(row, column)];
-          for (int m = 0; m < piece_block; ++m)
-            block.at[m] += dot(own[m / piece_modes], other[m % piece_modes]);
+      if (!held(i)) return;
+      for (int32 n = levels_.fine_start[i]; n < levels_.fine_start[i + 1]; ++n) {
+        const std::int64_t j = levels_.fine_column[n];
+        if (!held(j)) continue;
+        const double stiffness = times * double(levels_.fine_value[n]);
+        Work::each_share(levels_, i, [&](int, int p, T weight) {
+          Vec3<double> own[piece_modes], other[piece_modes];
+          held_modes(i, p, double(weight) * stiffness, free[i], lane, own);
+          Work::each_share(levels_, j, [&](int, int q, T share) {
+            if (q > p) return;
+            held_modes(j, q, double(share), free[j], lane, other);
+            Block& block = to[piece_pair(rank_of(mask, p), rank_of(mask, q))];
+            for (int m = 0; m < piece_block; ++m)
+              block.at[m] += dot(own[m / piece_modes], other[m % piece_modes]);
+          });
         });
-      });
+      }
     });
   }
 
-  void held_modes(std::int64_t i, int piece, double weight, const Vec3<double> (&held)[3], int lane,
+  // (1 - P) of the displacements by all modes
+  void held_modes(std::int64_t i, int piece, double weight, const Mat3<Real>& free, int lane,
                   Vec3<double> (&mode)[piece_modes]) const {
+    Vec3<double> held[3];
+    for (int a = 0; a < 3; ++a) {
+      const Vec3<Real>& row = free.row[a];
+      held[a] = {(a == 0) - Work::number(row.x, lane), (a == 1) - Work::number(row.y, lane),
+                 (a == 2) - Work::number(row.z, lane)};
+    }
     const Four arm = centred(arm_of(i, lane), piece, lane);
     const double x = arm.v[1], y = arm.v[2], z = arm.v[3];
     const Vec3<double> moved[piece_modes] = {{1, 0, 0},  {0, 1, 0},  {0, 0, 1},

@@ -72,18 +72,19 @@ struct PiecesWork {
     double at[piece_block];
   };
   struct Factors {
-    DenseFactor energy, matrix;   // of Hc and Ac in the scale of the diagonal of Ac
-    DenseFactor unheld;           // Hc there before contacts hold it; none without contacts
-    std::vector<double> scale;    // 1 / sqrt(Ac_ii), 0 for a mode that moves nothing
-    std::vector<double> own, image;  // Z^T q, and what a product needs
+    DenseFactor energy, matrix;        // of Hc and Ac in the scale of the diagonal of Ac
+    DenseFactor unheld;                // Hc there before contacts hold it; none without contacts
+    std::vector<double> scale;         // 1 / sqrt(Ac_ii), 0 for a mode that moves nothing
+    std::vector<double> own, image;    // Z^T q, and what a product needs
     bool sound = false, held = false;  // whether it could be made; whether Hc has contacts
   };
   // what a thread needs of a patch
   struct Slots {
-    Row<Quad<T>> position;         // [slots]
-    Row<PieceMask> mask;           // [slots]
-    Row<T> weight;                 // [pieces, slots]
-    Row<Pack<T, native_width<T>>>  // blocks of pairs; at most nine numbers of a mode and their duals
+    Row<Quad<T>> position;  // [slots]
+    Row<PieceMask> mask;    // [slots]
+    Row<T> weight;          // [pieces, slots]
+    Row<Pack<T,
+             native_width<T>>>  // blocks of pairs; at most nine numbers of a mode and their duals
         sums, strains, stresses;
   };
 
@@ -154,7 +155,8 @@ struct PiecesWork {
     for (std::int64_t i = 0; i < plan.vertices; ++i)
       each_share(levels, i, [&](int, int piece, T) { vertex[i] |= PieceMask(1) << piece; });
     first_pack.assign(plan.patches + 1, 0);
-    for (int pack = 0; pack < levels.piece_packs; ++pack) ++first_pack[levels.piece_pack_patch[pack] + 1];
+    for (int pack = 0; pack < levels.piece_packs; ++pack)
+      ++first_pack[levels.piece_pack_patch[pack] + 1];
     for (int patch = 0; patch < plan.patches; ++patch) {
       first_pack[patch + 1] += first_pack[patch];
       PieceMask mask = 0;

@@ -253,8 +253,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
       scales[lane] = search.scale;
       const bool begins = k >= (HasContacts ? touching_pieces_begin : pieces_begin);
       // alone a lane of Jacobi iterations would not be here
-      asks[lane] =
-          !done_[lane] && !search.jacobi && (made_[lane] ? search.is_outdated() : begins);
+      asks[lane] = !done_[lane] && !search.jacobi && (made_[lane] ? search.is_outdated() : begins);
       some = some || asks[lane];
       if (!asks[lane]) continue;
       made_[lane] = true;
@@ -269,7 +268,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
         holds[lane] = made_[lane] && !holds_[lane] && !done_[lane] && !search_[lane].jacobi;
         holds_[lane] = holds_[lane] || holds[lane];
       }
-      if (uses_space_) pieces_.hold(o_.free, holds);
+      if (uses_space_) pieces_.hold(o_.free, holds, scales);
     }
   }
 

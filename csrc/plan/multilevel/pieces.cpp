@@ -12,7 +12,8 @@ namespace {
 
 constexpr int blend_sweeps = 2;
 constexpr double blend_damping = 2.0 / 3.0;  // of the Jacobi sweeps
-constexpr double least_share = 0.1;          // smaller ones would make more elements bend, and save no iterations
+constexpr double least_share =
+    0.1;  // smaller ones would make more elements bend, and save no iterations
 
 using Share = std::pair<std::int32_t, double>;  // of a piece in the motion of a vertex
 
@@ -85,8 +86,8 @@ Aggregates limited(Aggregates groups, std::int32_t most) {
 
 Pieces cut_pieces(const FineMatrix& fine, const Graph& graph, const std::vector<double>& inertia) {
   const auto free = double(std::count(fine.held.begin(), fine.held.end(), 0));
-  const auto wanted = std::int32_t(std::clamp(std::round(2 * std::cbrt(free)), 1.0,
-                                              double(most_pieces)));
+  const auto wanted =
+      std::int32_t(std::clamp(std::round(2 * std::cbrt(free)), 1.0, double(most_pieces)));
   const Aggregates groups = limited(aggregate(graph, fine.held, wanted), most_pieces);
   Shares shares = one_each(groups);
   for (int sweep = 0; sweep < blend_sweeps; ++sweep)

@@ -11,12 +11,12 @@ namespace pd::inline PD_TARGET {
 constexpr double armijo_factor = 1e-4;  // share of the decrease that the slope predicts (Armijo)
 // factor of the step length after a failed trial: a body that lands has contacts within micrometres
 constexpr double step_reduction = 0.5, contact_step_reduction = 0.25;
-constexpr int failures_before_clearing = 2;  // failed trials before L-BFGS restarts
-constexpr int most_reductions = 12;          // before a fallback of Jacobi iterations
+constexpr int failures_before_clearing = 2;             // failed trials before L-BFGS restarts
+constexpr int most_reductions = 12;                     // before a fallback of Jacobi iterations
 constexpr int fallback_length = 2, most_doublings = 3;  // of the first fallback; of that length
 constexpr int friction_fallback_length = 8;             // of every one with friction
 constexpr int unsettled_fallbacks = 3,
-              unsettled_failures = 2;  // with friction the first fallbacks come earlier
+              unsettled_failures = 2;     // with friction the first fallbacks come earlier
 constexpr int failures_before_plain = 4;  // failed accelerated iterations before a plain one
 // Without contacts the coarse problem is rebuilt after so many trials in a row that lowered E by less than this share of what the
 // slope promises, half of it at full length: then H has changed.
@@ -222,8 +222,8 @@ struct LineSearch {
 
   PD_HD void start_fallback() {
     fallback_left = friction ? friction_fallback_length
-                             : fallback_length << (fallbacks < most_doublings ? fallbacks
-                                                                               : most_doublings);
+                             : fallback_length
+                                   << (fallbacks < most_doublings ? fallbacks : most_doublings);
     ++fallbacks;
     jacobi = true;
     failures = reductions = 0;

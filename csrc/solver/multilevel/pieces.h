@@ -15,7 +15,7 @@
 //
 // Contacts: with the projector P on what they leave free, P (..) P is what an iteration uses. M P alone would let a body that
 // lies on the ground go down as if there were none: (P M P) instead of (P A P)^-1. The second term has no such motions, and Hc
-// gets the springs sum D_i |(I - P_i) dx_i|^2, about what it costs a vertex to stay behind.
+// gets e^T A e, e = (I - P) dx, about what it costs the held vertices to stay behind.
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
@@ -25,9 +25,9 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int most_pieces = 64;        // a bit each of PieceMask
-constexpr int pieces_of_vertex = 4;    // at most
-constexpr int piece_modes = 6;         // three translations, three turns about its centre
+constexpr int most_pieces = 64;      // a bit each of PieceMask
+constexpr int pieces_of_vertex = 4;  // at most
+constexpr int piece_modes = 6;       // three translations, three turns about its centre
 constexpr int piece_block = piece_modes * piece_modes;
 
 using PieceMask = std::uint64_t;
@@ -90,10 +90,9 @@ struct PieceStrain {
     const Vec3<R> g = (change * rest_inverse) * back;
     Vec3<R> moved[4];
     for (int c = 0; c < 4; ++c) moved[c] = weight[c] * arm[c];
-    const Mat3<R> p =
-        (from_columns(moved[1] - moved[0], moved[2] - moved[0], moved[3] - moved[0]) *
-         rest_inverse) *
-        back;
+    const Mat3<R> p = (from_columns(moved[1] - moved[0], moved[2] - moved[0], moved[3] - moved[0]) *
+                       rest_inverse) *
+                      back;
     const R zero(scalar_of<R>(0));
     const Vec3<R> none = {zero, zero, zero};
     set(0, {{g, none, none}});
