@@ -155,10 +155,11 @@ def test_print_says_what_a_step_takes_on_a_gpu(kernel: str, monkeypatch: pytest.
         assert str(sim).splitlines()[-2].endswith(f" B, {words}{most}")
 
 
-@pytest.mark.parametrize(("outer", "more"), [("momentum", 8), ("lbfgs", 24), ("corotated", 24 + 8)])
+@pytest.mark.parametrize(("outer", "more"), [("momentum", 8), ("lbfgs", 24 + 2)])
 def test_workspace_of_the_multilevel_solver(outer: str, more: int) -> None:
-    """Quads of a vertex beside those of Chebyshev; one chunk and one patch of sums and two matrices of 24 modes."""
+    """Quads of a vertex beside those of Chebyshev, and two matrices of six modes of each piece."""
     sim = simulator(bare(), torch.float32, solver=pd.Multilevel(outer))
-    assert sim.plan.patches == 1
+    pieces = int(sim.plan.piece_of.max()) + 1
+    assert pieces == 7
     extra = workspace_bytes(sim.plan, 4, sim.solver) - workspace_bytes(sim.plan, 4, pd.Chebyshev())
-    assert extra == 16 * 36 * more + (8 * (512 + 300 + 2 * 576) if outer == "corotated" else 0)
+    assert extra == 16 * 36 * more + (8 * 2 * (6 * pieces) ** 2 if outer == "lbfgs" else 0)

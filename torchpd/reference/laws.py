@@ -227,9 +227,13 @@ class Corotated(Law):
         """
         if F.shape[2] == 2:
             return super().blocks(F, positive=positive)
-        left, values, right = singular_frames(F)
+        left, _, right = frames = singular_frames(F)
         p = self._pressure(F, left @ right)[2][self.members]
-        share = 1.0 - self.bulk * p / self.shear
+        return self._twisted(frames, 1.0 - self.bulk * p / self.shear, positive=positive)
+
+    def _twisted(self, frames: tuple[Array, Array, Array], share: Array, *, positive: bool) -> Array:
+        """The blocks from U, s and V^T, with the share of 2 mu that tension leaves."""
+        left, values, right = frames
         blocks = np.repeat(np.eye(9)[None], len(left), axis=0)
         for i, j in ((0, 1), (1, 2), (2, 0)):
             twist = np.zeros((3, 3))
@@ -241,17 +245,15 @@ class Corotated(Law):
         return scaled(self.shear * self.measure, blocks)
 
     def blocks_alone(self, F: Array) -> Array:
-        """For d = 3 linear elasticity in the frame of the element: 2 mu |sym(dF R^T)|^2 + lambda tr(dF R^T)^2."""
+        """For d = 3 every element has its own trace, and lambda tr(dF R^T)^2 beside what is clamped."""
         if F.shape[2] == 2:
             return super().blocks_alone(F)
-        R = nearest_orthonormal(F)
-        basis = np.swapaxes(np.eye(9).reshape(9, 3, 3), 1, 2)
-        turned = np.einsum("kij,nlj->nkil", basis, R)
-        even = (0.5 * (turned + np.swapaxes(turned, 2, 3))).reshape(-1, 9, 9)
-        trace = np.einsum("nkii->nk", turned)
-        shear, bulk = self.shear * self.measure, self.bulk * self.measure
-        own = even @ np.swapaxes(even, 1, 2)
-        return scaled(shear, own) + scaled(bulk, trace[:, :, None] * trace[:, None, :])
+        left, _, right = frames = singular_frames(F)
+        R = left @ right
+        share = 1.0 - np.minimum(self.bulk * inner(R, F - R), self.shear) / self.shear
+        rows = np.swapaxes(R, 1, 2).reshape(-1, 9)
+        bulk = scaled(self.bulk * self.measure, rows[:, :, None] * rows[:, None, :])
+        return self._twisted(frames, share, positive=True) + bulk
 
     def _cap_rates(self, rate: Array) -> dict[str, Array]:
         """Derivatives through c [N], from dE/dc [groups]."""

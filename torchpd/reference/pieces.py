@@ -220,7 +220,7 @@ class PieceSpace:
 
     @cached_property
     def hessian_alone(self) -> Array:
-        """The same where every element stands alone and solids are linear in their frames, as L-BFGS takes it."""
+        """The same where every element stands alone, without traces that groups share, as L-BFGS takes it."""
         reduced = self._inertia()
         for group in self.problem.groups:
             reduced += self._reduced(group, group.law.blocks_alone(group.deformation(self.displacement)))

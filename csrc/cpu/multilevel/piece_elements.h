@@ -124,11 +124,11 @@ class PieceElements {
     R share[4];
     for (int c = 0; c < 4; ++c)
       x[c] = gather_corner<T, R::width>(slots_.position.begin(), tets.slot[c]);
-    const Mat3<R> back = transpose(nearest_rotation(deformation_gradient(x, tets.inverse)));
+    const PieceFrame<R> frame(deformation_gradient(x, tets.inverse), tets.weight, tets.pressure);
     auto* strains = reinterpret_cast<PieceStrain<R>*>(slots_.strains.begin());
     for (int k = 0; k < pieces; ++k) {
       read_piece(tets, x, rank_[k], arm, share);
-      strains[k] = PieceStrain<R>(tets.inverse, back, arm, share);
+      strains[k] = PieceStrain<R>(tets.inverse, frame, arm, share);
     }
     if (weights_.pressure) {
       add_strains<true>(strains, pieces, tets.weight, tets.pressure);
@@ -137,7 +137,7 @@ class PieceElements {
     }
   }
 
-  // Of six numbers half are none.
+  // Of six numbers of a strain half are none.
   template <bool Dilates>
   void add_strains(const PieceStrain<R>* strains, int pieces, const R& weight, const R& pressure) {
     for (int k = 0; k < pieces; ++k) {
@@ -150,7 +150,7 @@ class PieceElements {
           for (int j = 0; j < piece_modes; ++j) {
             R sum = to[piece_modes * i + j];
             PD_UNROLL
-            for (int c = 0; c < 6; ++c) {
+            for (int c = 0; c < PieceStrain<R>::numbers; ++c) {
               const bool moves = strain_moves(i, c) || (Dilates && c < 3);
               if (moves && strain_moves(j, c))
                 sum = multiply_add(stress.h[i][c], strains[l].h[j][c], sum);

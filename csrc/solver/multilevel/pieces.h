@@ -10,8 +10,8 @@
 // A vertex moves by the twists of up to four pieces with weights that add up to one, so pieces bend into each other. Z was taken at
 // the positions where Hc was made. Turns to first order strain what is strained, within a piece too.
 //
-//   tetrahedra      V (2 mu |sym(dF R^T)|^2 + lambda tr(dF R^T)^2): linear elasticity in the frame of the element
-//   other kinds     dF^T K dF with their own second derivative K at F, its negative eigenvalues set to zero
+// H is the second derivative of each element by itself, its negative eigenvalues set to zero. The stiffness of what is stretched
+// against turns is a part of it: without it a body of 1e8 Pa with strains of a half took eight times the iterations.
 //
 // Contacts: with the projector P on what they leave free, P (..) P is what an iteration uses. M P alone would let a body that
 // lies on the ground go down as if there were none: (P M P) instead of (P A P)^-1. The second term has no such motions, and Hc
@@ -19,6 +19,7 @@
 #pragma once
 #include "math/mat.h"
 #include "math/scalar.h"
+#include "math/stretch.h"
 
 #include <cmath>
 #include <cstdint>
@@ -73,34 +74,60 @@ PD_HD constexpr bool strain_moves(int mode, int c) {
       {true, false, false, true, true, false}, {false, true, false, true, false, true},
       {false, false, true, false, true, true}, {false, true, true, true, true, true},
       {true, false, true, true, true, true},   {true, true, false, true, true, true}};
-  return moves[mode][c];
+  return c >= 6 || moves[mode][c];
 }
 
-// Strain of a tetrahedron by the modes of a piece: six numbers of sym(dF R^T), whose products are those of the matrices. dF R^T of a
-// translation along e is e g^T, that of a turn about e is e x p.
+// A tetrahedron at F: R^T, and what twists about the axes u_k of its stretches cost beside none: 1 - 2 / (s_i + s_j), at least 0,
+// where tension takes its share of the 2.
+template <class R>
+struct PieceFrame {
+  Mat3<R> back;
+  Vec3<R> twist[3];  // u_k times the root of half of that
+
+  // `weight`: V 2 mu; `pressure`: V lambda
+  PD_HD PieceFrame(const Mat3<R>& f, const R& weight, const R& pressure) {
+    using T = scalar_of<R>;
+    const R none(T(0)), one(T(1));
+    const Mat3<R> rotation = nearest_rotation(f);
+    back = transpose(rotation);
+    const Stretches<R> at(f, rotation);
+    const R trace = ((at.s[0] + at.s[1]) + at.s[2]) - R(T(3));
+    const R known = select(none < weight, weight, one);
+    const R share = one - lesser(pressure * trace, known) / known;
+    for (int k = 0; k < 3; ++k) {
+      const R sum = at.s[(k + 1) % 3] + at.s[(k + 2) % 3], least(smallest<T>() * T(4));
+      const R soft = lesser(one, R(T(2)) * share / greater(sum, least));
+      twist[k] = square_root(R(T(0.5)) * (one - soft)) * at.left[k];
+    }
+  }
+};
+
+// Strain of a tetrahedron by the modes of a piece: six numbers of sym(dF R^T), whose products are those of the matrices, and three
+// of its twists. dF R^T of a translation along e is e g^T, that of a turn about e is e x p.
 template <class R>
 struct PieceStrain {
-  R h[piece_modes][6];
+  static constexpr int numbers = 9;
+  R h[piece_modes][numbers];
 
   PieceStrain() = default;
-  // `back`: R^T; `arm`: corners from the centre of the piece; `weight`: of the corners in it
-  PD_HD PieceStrain(const Mat3<R>& rest_inverse, const Mat3<R>& back, const Vec3<R> (&arm)[4],
-                    const R (&weight)[4]) {
+  // `arm`: corners from the centre of the piece; `weight`: of the corners in it
+  PD_HD PieceStrain(const Mat3<R>& rest_inverse, const PieceFrame<R>& frame,
+                    const Vec3<R> (&arm)[4], const R (&weight)[4]) {
     const Vec3<R> change = {weight[1] - weight[0], weight[2] - weight[0], weight[3] - weight[0]};
-    const Vec3<R> g = (change * rest_inverse) * back;
+    const Vec3<R> g = (change * rest_inverse) * frame.back;
     Vec3<R> moved[4];
     for (int c = 0; c < 4; ++c) moved[c] = weight[c] * arm[c];
     const Mat3<R> p = (from_columns(moved[1] - moved[0], moved[2] - moved[0], moved[3] - moved[0]) *
                        rest_inverse) *
-                      back;
+                      frame.back;
     const R zero(scalar_of<R>(0));
     const Vec3<R> none = {zero, zero, zero};
-    set(0, {{g, none, none}});
-    set(1, {{none, g, none}});
-    set(2, {{none, none, g}});
-    set(3, {{none, -p.row[2], p.row[1]}});
-    set(4, {{p.row[2], none, -p.row[0]}});
-    set(5, {{-p.row[1], p.row[0], none}});
+    set(0, frame, {{g, none, none}});
+    set(1, frame, {{none, g, none}});
+    set(2, frame, {{none, none, g}});
+    set(3, frame, {{none, -p.row[2], p.row[1]}});
+    set(4, frame, {{p.row[2], none, -p.row[0]}});
+    set(5, frame, {{-p.row[1], p.row[0], none}});
   }
 
   // the stress to each: 2 mu V strain + lambda V trace
@@ -108,7 +135,7 @@ struct PieceStrain {
   PD_HD PieceStrain stressed(const R& weight, const R& pressure) const {
     PieceStrain stress;
     for (int i = 0; i < piece_modes; ++i) {
-      for (int c = 0; c < 6; ++c) stress.h[i][c] = weight * h[i][c];
+      for (int c = 0; c < numbers; ++c) stress.h[i][c] = weight * h[i][c];
       if (!Dilates) continue;
       const R part = pressure * ((h[i][0] + h[i][1]) + h[i][2]);
       for (int c = 0; c < 3; ++c) stress.h[i][c] = stress.h[i][c] + part;
@@ -117,7 +144,7 @@ struct PieceStrain {
   }
 
  private:
-  PD_HD void set(int mode, const Mat3<R>& d) {
+  PD_HD void set(int mode, const PieceFrame<R>& frame, const Mat3<R>& d) {
     const R root_half(scalar_of<R>(0.70710678118654752440));
     h[mode][0] = d.row[0].x;
     h[mode][1] = d.row[1].y;
@@ -125,6 +152,9 @@ struct PieceStrain {
     h[mode][3] = root_half * (d.row[0].y + d.row[1].x);
     h[mode][4] = root_half * (d.row[0].z + d.row[2].x);
     h[mode][5] = root_half * (d.row[1].z + d.row[2].y);
+    const Vec3<R> axis = {d.row[2].y - d.row[1].z, d.row[0].z - d.row[2].x,
+                          d.row[1].x - d.row[0].y};
+    for (int k = 0; k < 3; ++k) h[mode][6 + k] = dot(frame.twist[k], axis);
   }
 };
 
