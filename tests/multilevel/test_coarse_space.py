@@ -74,7 +74,49 @@ def test_slivers_take_hardly_more() -> None:
 
 def test_stiff_slabs_in_soft_surroundings() -> None:
     """Contrast of 1e4, where a space that is never made anew stalls at an error of 1e-2."""
-    assert counts(slabs())[2] <= 53
+    assert np.all(np.array(counts(slabs())) <= [20, 25, 30])
+
+
+@pytest.mark.parametrize(("kind", "contrast"), [("slabs", 1e4), ("held slabs", 1e4), ("cubes", 1e2)])
+def test_contrast_of_stiffness(kind: str, contrast: float) -> None:
+    """A soft beam held at x = 0, thrown down, with stiff slabs or cubes of one cell."""
+    mesh = pd.shapes.box((1.0, 0.2, 0.2), (20, 4, 4))
+    cell = np.floor(mesh.vertices[mesh.tets].mean(axis=1) * 20).astype(int)
+    stiff = {
+        "slabs": cell[:, 0] // 2 % 2 == 1,
+        "held slabs": cell[:, 0] // 2 % 2 == 0,
+        "cubes": (cell % 2 == 1).all(axis=1) & (cell[:, 0] % 4 == 1),
+    }[kind]
+    body = pd.Solid(mesh, youngs=np.where(stiff, 1e4 * contrast, 1e4), density=1000.0)
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0), pd.Gravity())
+    velocities = np.zeros_like(mesh.vertices)
+    velocities[:, 1] = -10.0 * mesh.vertices[:, 0] ** 2
+    case = Case(scene, mesh.vertices, velocities, 1.0 / 30.0)
+    problem = case.problem()
+    first = problem.first_iterate("velocity")
+    solution = newton(problem, first, tolerance=1e-8)  # rounding of the stiff elements' forces leaves up to 1e-9
+    sim = simulator(case, torch.float64, solver=pd.Multilevel(), iterations=32)
+    assert relative_error(displacement(sim, sim(state_of(case, sim))), solution, first) <= 2e-3
+
+
+def test_cloth_has_pieces_too() -> None:
+    """A sheet that swings about an edge: L-BFGS without pieces takes 78 iterations to 1e-2."""
+    side = np.linspace(0.0, 1.0, 31)
+    x, z = (part.ravel() for part in np.meshgrid(side, side, indexing="ij"))
+    vertices = np.stack([x, 0.0 * x, z], axis=1)
+    corner = np.arange(31 * 31).reshape(31, 31)
+    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:]))
+    triangles = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    body = pd.Cloth(pd.TriMesh(vertices, triangles), youngs=1e6, thickness=1e-3, area_density=0.2)
+    velocities = np.zeros_like(vertices)
+    velocities[:, 1] = -3.0 * x**2
+    scene = pd.Scene(body, pd.Pin(body, x == 0.0), pd.Gravity())
+    case = Case(scene, vertices, velocities, 1.0 / 60.0, start="inertial")
+    problem = case.problem()
+    first = problem.first_iterate("inertial")
+    sim = simulator(case, torch.float64, solver=pd.Multilevel(), iterations=36)
+    u = displacement(sim, sim(state_of(case, sim), **arguments_of(case, sim)))
+    assert relative_error(u, newton(problem, first, tolerance=1e-8), first) <= 1e-2
 
 
 def pieces_of(plan: Plan) -> Pieces:

@@ -149,9 +149,8 @@ class Multilevel:
     one or two dozen iterations at any stiffness and size. An iteration costs 4 to 6 times as much as a Jacobi iteration
     on a CPU, and 11 to 29 times on a GPU. The scene takes longer to compile.
 
-    A line search checks the energy of each iterate. After four rejected trials in a row, two accelerated Jacobi
-    iterations follow, then four, eight and so on. With contacts, "lbfgs" shortens rejected trials instead. It takes
-    Jacobi iterations after twelve rejections, or with friction after the first two. "momentum" does not model contacts.
+    A line search checks the energy of each iterate, and shortens rejected trials. After twelve of a step, or with
+    friction after the first two, accelerated Jacobi iterations follow. "momentum" does not model contacts.
 
     M is prepared once, for the material of that time (`Simulator.prepare_solver`). An environment with another material
     gets M / s, where s is its largest ratio of inertia or stiffness to that material; `Info.rho` reports the mismatch.

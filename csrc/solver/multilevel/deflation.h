@@ -1,4 +1,4 @@
-// The small problem of the solver "corotated". Where parts of a body turn, A is far too stiff: it holds every element to the
+// The small problem of L-BFGS on a GPU; that of a CPU: solver/multilevel/pieces.h. A is far too stiff where parts turn: it holds every element to the
 // rotation that it has. On a space V of such motions the second derivative of the energy takes the place of A:
 //
 //   V Hc^-1 V^T + (I - V Ac^-1 (A V)^T) M (I - A V Ac^-1 V^T),   Ac = V^T A V,
