@@ -238,10 +238,9 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
   }
 
  private:
-  // whether the coarse problem includes contacts
+  // whether contacts or pins that M does not know hold vertices, and the coarse space includes them
   bool is_held(int lane) const {
-    if constexpr (!HasContacts) return false;
-    return made_[lane] && pieces_.is_held(lane);
+    return made_[lane] && (mismatch_[lane].has_outliers || pieces_.is_held(lane));
   }
 
   // Makes the coarse space of the lanes that need it at iteration k, at their iterates.
