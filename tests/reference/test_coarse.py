@@ -230,7 +230,7 @@ def test_pins_leave_turns(held: list[int], free: int) -> None:
     problem = step_problem(scene.values(), x, 0.0 * x, H)
     rigid = RigidMotions(problem, np.zeros_like(x), (np.arange(len(x)),))
     assert rigid.modes.shape[2] == free
-    moved = rigid.moved(0.3 * np.ones(free))
+    moved = rigid.after(0.3 * np.ones(free)).displacement
     lengths = [np.linalg.norm(y[:, None] - y[None], axis=2) for y in (x, x + moved)]
     np.testing.assert_allclose(*lengths, atol=1e-14)
     assert np.abs(moved[held]).max(initial=0.0) == 0.0

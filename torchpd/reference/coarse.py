@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,7 @@ __all__ = ["Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-PASSES = 12  # Newton passes of an outer step
+PASSES = 16  # Newton passes of an outer step
 SETTLE = 4  # minimisations of an outer step, between which friction radii go half of the way to friction l
 HALVINGS = 8
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
@@ -51,8 +51,6 @@ class Motions(ABC):
     problem: StepProblem
     displacement: Array  # [V, 3] m, of the whole scene
     bodies: tuple[Index, ...]  # vertices of every body
-
-    outer: ClassVar[int]  # outer steps, which take turns, gaps and friction radii anew
 
     @cached_property
     def free(self) -> list[Index]:
@@ -85,11 +83,12 @@ class Motions(ABC):
         """Second derivative [N, N] by the motions, positive definite."""
 
     @abstractmethod
-    def moved(self, motion: Array) -> Array:
-        """Displacement [V, 3] m after motions [N]; hard pins stay."""
+    def after(self, motion: Array) -> Self:
+        """The same after motions [N]; hard pins stay."""
 
+    @property
     @abstractmethod
-    def energy(self, displacement: Array) -> float:
+    def energy(self) -> float:
         """The energy [J] of the island."""
 
     def jacobian(self, contacts: Envelopes) -> Array:
@@ -103,8 +102,6 @@ class Motions(ABC):
 @dataclass(frozen=True)
 class RigidMotions(Motions):
     """Twists (v, w) of the bodies: y = c + exp([w]x) (y - c) + v with the centre c, and sum a / 2 |u - s|^2."""
-
-    outer = 3
 
     @cached_property
     def bases(self) -> list[tuple[Array, Array]]:
@@ -163,16 +160,17 @@ class RigidMotions(Motions):
                 hessian[columns, columns] = exact
         return np.asarray(hessian)
 
-    def moved(self, motion: Array) -> Array:
-        """Displacement [V, 3] m after finite motions along the twists [N]; hard pins stay."""
+    def after(self, motion: Array) -> RigidMotions:
+        """The same after finite motions along the twists [N]; hard pins stay."""
         displacement = self.displacement.copy()
         for own, arms, basis, _, columns in self.parts:
             displacement[own] += _finite(basis @ motion[columns], arms)
-        return displacement
+        return replace(self, displacement=displacement)
 
-    def energy(self, displacement: Array) -> float:
+    @property
+    def energy(self) -> float:
         """sum a / 2 |u - s|^2 [J] of the free vertices of the island."""
-        left = (displacement - self.problem.target)[self.vertices]
+        left = (self.displacement - self.problem.target)[self.vertices]
         return 0.5 * float(self.problem.weight[self.vertices] @ (left**2).sum(axis=1))
 
 
@@ -223,72 +221,42 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
-    for _ in range(motions.outer):
-        if not motions.modes.shape[2]:
-            break
-        jacobian = motions.jacobian(contacts)
-        motion, radius = _settled(motions, contacts, jacobian, radius)
-        energy = motions.energy(motions.displacement) + contacts.energy(radius)
+    for _ in range(PASSES if motions.modes.shape[2] else 0):
+        step = _newton_step(motions, contacts, radius)
+        energy, moved = motions.energy + contacts.energy(radius), 0.0
         for _ in range(HALVINGS):
-            moved = motions.moved(motion)
-            after = contacts_at(problem, moved, forces, vertices, pairs)
-            way = (contacts.weights[:, :, None] * (moved - motions.displacement)[contacts.vertices]).sum(axis=1)
-            trial = replace(contacts.shifted(way), gaps=after.gaps)
-            if motions.energy(moved) + trial.energy(radius) <= energy * (1.0 + EXACT):
+            trial = motions.after(step)
+            after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
+            way = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
+            reached = trial.energy + replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
+            if reached <= energy + EXACT * abs(energy):
+                moved = np.abs(trial.displacement - motions.displacement).max()
+                motions, contacts = trial, after
                 break
-            motion = 0.5 * motion
-        else:
+            step = 0.5 * step
+        STATS[0] += 1
+        lag = contacts.friction * contacts.normal_forces() - radius
+        if moved < STILL * motions.size and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
             break
-        still, motions, contacts = motions, replace(motions, displacement=moved), after
-        radius = contacts.friction * trial.normal_forces()
-        if np.abs(moved - still.displacement).max() < EXACT * motions.size:
-            break
+        if moved < WAIT * motions.size:
+            radius = radius + SHARE * lag
+    STATS[1] += 1; STATS[2] = max(STATS[2], STATS[0] - STATS[3]); STATS[3] = STATS[0]
     return _pushed(motions, contacts, radius), contacts.forces(radius)
 
 
-def _settled(motions: Motions, contacts: Envelopes, jacobian: Array, radius: Array) -> tuple[Array, Array]:
-    """Motions [N] of the quadratic model, and friction radii [m] N near those of the normal forces that they leave.
-
-    Radii that follow the normal forces at once oscillate where a stiff body lands on rough ground; half of the way
-    settles. Each radius waits for the minimum: an unfinished one leads to other contact forces in a rough corner. The
-    motions minimise the model for the radii returned, which the guard needs.
-    """
-    motion = np.zeros(len(motions.gradient))
-    for _ in range(SETTLE - 1):
-        motion = _newton_passes(motions, contacts, jacobian, radius, motion)
-        lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
-        if np.linalg.norm(lag) <= EXACT * np.linalg.norm(radius):
-            return motion, radius
-        radius = radius + 0.5 * lag
-    return _newton_passes(motions, contacts, jacobian, radius, motion), radius
+STATS = [0, 0, 0, 0]
+STILL = 1e-6
+SHARE = 0.5
+LAST = 1
+WAIT = 1e-3
 
 
-def _newton_passes(motions: Motions, contacts: Envelopes, jacobian: Array, radius: Array, motion: Array) -> Array:
-    """Motions [N] of least quadratic model of Phi for fixed friction radii [m] N, from given ones."""
-    gradient, hessian = motions.gradient, motions.hessian
-
-    def model(motion: Array, moved: Envelopes) -> float:
-        return moved.energy(radius) + float((gradient + 0.5 * hessian @ motion) @ motion)
-
-    trial = contacts.shifted(jacobian @ motion)
-    energy = model(motion, trial)
-    for _ in range(PASSES):
-        forces, second = trial.forces(radius), trial.second_derivatives(radius)
-        on = second.any(axis=(1, 2))
-        matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-        step = np.linalg.solve(matrix, np.einsum("min,mi->n", jacobian, forces) - gradient - hessian @ motion)
-        for _ in range(HALVINGS):
-            moved = contacts.shifted(jacobian @ (motion + step))
-            reached = model(motion + step, moved)
-            if reached <= energy + EXACT * abs(energy):
-                break
-            step = 0.5 * step
-        else:
-            break
-        motion, trial, energy = motion + step, moved, reached
-        if np.abs(motions.modes @ step).max() < EXACT * motions.size:
-            break
-    return motion
+def _newton_step(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
+    """The step [N] of Newton's method on Phi for fixed friction radii [m] N."""
+    jacobian, second = motions.jacobian(contacts), contacts.second_derivatives(radius)
+    on = second.any(axis=(1, 2))
+    matrix = motions.hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
+    return np.linalg.solve(matrix, np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient)
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:

@@ -36,18 +36,24 @@ def corrected(
 
 
 def first_iterate(problem: StepProblem) -> Array:
-    """u_0 [V, 3] m: every body in its present shape on its rigid course, or at h v if that has the lower energy.
+    """u_0 [V, 3] m: every body in its present shape, or at h v if that has the lower energy; both corrected.
 
-    Both are corrected. The present shape keeps the contact forces of the elastic forces at the step's start.
+    Contacts start from the forces that answer the gradients of either state; that of the present shape has no inertia.
+    Elastic energies differ by the work of the mean of both elastic gradients, which a rigid motion does not change.
     """
-    still = problem.project(problem.hold(np.zeros_like(problem.positions)))
-    pull = np.where(problem.free[:, None], problem.weight[:, None] * (still - problem.target), 0.0)
-    forces = pushes_of(problem, still, problem.gradient(still) - pull)
-    guess = problem.hold(problem.time_step * problem.velocities)
-    kept = correct(problem, rigid_fit(problem, still, guess), forces)[0]
-    moved = corrected(problem, problem.project(guess))
-    lower, component = problem.energies(moved) < problem.energies(kept), problem.values.component
-    return np.where(lower[component, None], moved, kept)
+    still, guess = (problem.hold(u) for u in (np.zeros_like(problem.positions), problem.time_step * problem.velocities))
+    states = [problem.project(still), problem.project(guess)]
+    gradients = [problem.gradient(u) for u in states]
+    pulls = [np.where(problem.free[:, None], problem.weight[:, None] * (u - problem.target), 0.0) for u in states]
+    forces = [gradients[0] - pulls[0], gradients[1]]
+    kept, moved = (
+        correct(problem, u, pushes_of(problem, u, force))[0] for u, force in zip(states, forces, strict=True)
+    )
+    work = 0.5 * ((forces[0] + forces[1] - pulls[1]) * (states[1] - states[0])).sum(axis=1)
+    inertia = [0.5 * problem.weight * ((u - problem.target) ** 2).sum(axis=1) for u in (kept, moved)]
+    component = problem.values.component
+    rise = np.bincount(component, work + np.where(problem.free, inertia[1] - inertia[0], 0.0))
+    return np.where((rise < 0.0)[component, None], moved, kept)
 
 
 def rigid_fit(problem: StepProblem, displacement: Array, goal: Array) -> Array:
@@ -57,7 +63,7 @@ def rigid_fit(problem: StepProblem, displacement: Array, goal: Array) -> Array:
         for _ in range(PASSES):
             rigid = RigidMotions(toward, displacement, bodies)
             twists = np.asarray(-np.linalg.solve(rigid.hessian, rigid.gradient), np.float64)
-            displacement = rigid.moved(twists)
+            displacement = rigid.after(twists).displacement
             if np.abs(rigid.modes @ twists).max(initial=0.0) < EXACT * rigid.size:
                 break
     return displacement
@@ -98,7 +104,17 @@ def coarse_chebyshev(
             previous, current = previous + shifted - current, shifted
             gradient = problem.gradient(current)
         step = current - relaxation * gradient / scale
-        previous, current = current, problem.project(previous + omega * (step - previous), current)
+        ahead = previous + omega * (step - previous)
+        previous, current = current, problem.project(ahead, current)
         if observe is not None:
             observe(k + 1, current)
+    if LAST and iterations:
+        forces, before = [], ahead
+        for after in problem.projections(ahead, previous):
+            forces.append(np.where(problem.free[:, None], scale * (after - before), 0.0)/(relaxation*omega))
+            before = after
+        return correct(problem, current, np.stack(forces) if forces else np.zeros((0, *current.shape)))[0]
     return corrected(problem, current)
+
+
+LAST = 1

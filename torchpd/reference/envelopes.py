@@ -93,12 +93,10 @@ class Envelopes:
 
     def second_derivatives(self, radius: Array) -> Array:
         """Derivatives of -f by the relative displacement [m, 3, 3] N/m for a fixed radius; positive semidefinite."""
-        n, (t, share) = self.normals, self.tangent_forces(radius)
-        b = t / np.maximum(np.linalg.norm(t, axis=1, keepdims=True), 1e-300)
-        along = np.where(share < 1.0, 1.0, 0.0)[:, None, None] * b[:, :, None] * b[:, None, :]
+        n, share = self.normals, self.tangent_forces(radius)[1]
         normal = n[:, :, None] * n[:, None, :]
         pushed = (self.normal_forces() > 0.0)[:, None, None]
-        flat = share[:, None, None] * (np.eye(3) - normal - along)
+        flat = share[:, None, None] * (np.eye(3) - normal)
         return np.asarray(self.stiffness[:, None, None] * (np.where(pushed, normal, 0.0) + flat))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -27,9 +27,7 @@ class PieceMotions(Motions):
     """Motions Z q of the pieces of one island, and E with the Hessian Hc where the space was made."""
 
     space: PieceSpace
-
-    # gaps of planes are linear in q, and radii settle within an outer step
-    outer = 1
+    way: Array | None = None  # [N] motions from where the space was made
 
     @cached_property
     def columns(self) -> Index:
@@ -50,14 +48,21 @@ class PieceMotions(Motions):
     def hessian(self) -> Array:
         return np.asarray(self.space.hessian[np.ix_(self.columns, self.columns)])
 
-    def moved(self, motion: Array) -> Array:
+    def after(self, motion: Array) -> PieceMotions:
         displacement = self.displacement.copy()
         displacement[self.vertices] += self.modes @ motion
-        return displacement
+        moved = replace(self, displacement=displacement)
+        # the model: what changes linearly, and the same space
+        for name, value in (("modes", self.modes), ("hessian", self.hessian), ("columns", self.columns)):
+            moved.__dict__[name] = value
+        moved.__dict__["gradient"] = self.gradient + self.hessian @ motion
+        moved.__dict__["energy"] = self.energy + float((self.gradient + 0.5 * self.hessian @ motion) @ motion)
+        return moved
 
-    def energy(self, displacement: Array) -> float:
+    @cached_property
+    def energy(self) -> float:
         components = self.problem.values.component[[body[0] for body in self.bodies]]
-        return float(self.problem.energies(displacement)[components].sum())
+        return float(self.problem.energies(self.displacement)[components].sum())
 
 
 def piece_motions(space: PieceSpace) -> MotionsOf:

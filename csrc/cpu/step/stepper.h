@@ -80,32 +80,20 @@ class Stepper {
     team_.barrier();
   }
 
-  // Exact minimum of E along the rigid motions of every component that pins and contacts leave free.
+  // The coarse correction: every body that pins leave free takes the rigid motion with the least energy. The first one
+  // chooses between two iterates: the present shape, and the guess.
   void align() {
     const bool first = !started_;
     started_ = true;
     if (plan_.components == 0 || (first && set_.start() == StartKind::given)) return;
     if constexpr (HasContacts) {
-      if (first && team_.rank == 0)
-        begin_still(
-            plan_, w_, contacts_, [&](int i) { return vertex(i); },
-            [&](int i) { return guess(i); });
+      if (first) return choose_first_iterate();
+      keep_contact_forces(true, [](std::int64_t, const Vec3<Wide>&) {});
     }
-    bool goes_on = true;
-    for (int leg = 0; goes_on; ++leg) {
-      if (team_.rank == 0)
-        w_.some_go_on = find_motions<HasContacts>(plan_, w_, contacts_, first, leg);
-      team_.barrier();
-      goes_on = w_.some_go_on;
-      for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-        if (plan_.vertex_component[i] < 0) continue;
-        const Vec3<Real> y = Lanes::vec3(w_.x[i] + w_.u[i]);
-        const Vec3<Real> displacement = w_.motion[plan_.vertex_component[i]].of(y);
-        w_.u[i] = vertex(i).displaced(w_.u[i], displacement);
-        if (first) w_.before[i] = w_.u[i];
-      }
-      team_.barrier();
-    }
+    correct();
+    if (!first) return;
+    each_that_moves([&](std::int64_t i) { w_.before[i] = w_.u[i]; });
+    team_.barrier();
   }
 
   // The guess that the first iterate is made from.
@@ -153,6 +141,94 @@ class Stepper {
   }
 
  protected:
+  template <class Visit>
+  void each_that_moves(const Visit& visit) {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      if (plan_.vertex_component[i] >= 0) visit(i);
+    }
+  }
+
+  // Keeps the forces with which contacts answer the gradient of E at u; `full`: with inertia. Then visit(vertex, elastic force).
+  template <class Visit>
+  void keep_contact_forces(bool full, const Visit& visit) {
+    const Wide inertial(full ? 1.0 : 0.0);
+    sweep_.run(0, elastic_gradient<false>(), [&](std::int64_t i, const Value& force, Sum&) {
+      if (plan_.vertex_component[i] < 0) return;
+      const CoarseVertex<Wide> v = coarse_vertex(w_, i);
+      const Vec3<Wide> elastic = widened<Wide>(Lanes::vec3(force));
+      const Vec3<Wide> offset = v.u - widened<Wide>(Lanes::vec3(w_.target[i]));
+      const Vec3<Wide> gradient = multiply_add(inertial * Lanes::widen(w_.inertia[i]), offset, elastic);
+      const Vec3<Wide> free = subtract_product(v.u, Lanes::widen(w_.inverse[i]), gradient);
+      pd::keep_forces(contacts_, v, free, VertexForces<Lanes>{w_, plan_.vertices, int(i)});
+      visit(i, elastic);
+    });
+  }
+
+  // Moves every body by its rigid motion with the least energy, and then each vertex by what the contacts still push.
+  void correct() {
+    if (team_.rank == 0) find_motions<HasContacts>(plan_, w_, contacts_);
+    team_.barrier();
+    each_that_moves([&](std::int64_t i) {
+      CoarseVertex<Wide> v = coarse_vertex(w_, i);
+      const auto narrowed = [](const Vec3<Wide>& a) {
+        return Vec3<Real>{Lanes::narrow(a.x), Lanes::narrow(a.y), Lanes::narrow(a.z)};
+      };
+      const Vec3<Wide> way = w_.motion[plan_.vertex_component[i]].of(v.x + v.u);
+      Value u = vertex(i).displaced(w_.u[i], narrowed(way));
+      if constexpr (HasContacts) {
+        v.u = widened<Wide>(Lanes::vec3(u));
+        u = vertex(i).displaced(
+            u, narrowed(push_of(contacts_, v, VertexForces<Lanes>{w_, plan_.vertices, int(i)})));
+        u = vertex(i).project(contacts_, u, u);
+      }
+      w_.u[i] = u;
+    });
+    team_.barrier();
+  }
+
+  // Both first iterates are corrected: the present shape by the contacts' answer to the elastic forces alone, and the guess. The one
+  // of less energy stays. Elastic energies differ by the work of the mean of both elastic forces, which rigid motions do not change.
+  void choose_first_iterate() {
+    const auto way = [&](std::int64_t i) {
+      return widened<Wide>(Lanes::vec3(vertex(i).first_iterate(contacts_, guess(i)))) -
+             widened<Wide>(Lanes::vec3(vertex(i).current_iterate(contacts_)));
+    };
+    each_that_moves([&](std::int64_t i) { w_.u[i] = vertex(i).current_iterate(contacts_); });
+    team_.barrier();
+    keep_contact_forces(false, [&](std::int64_t i, const Vec3<Wide>& elastic) {
+      w_.work[i] = Lanes::narrow(Wide(0.5) * dot(elastic, way(i)));
+    });
+    correct();
+    each_that_moves([&](std::int64_t i) {
+      w_.before[i] = w_.u[i];
+      w_.u[i] = vertex(i).first_iterate(contacts_, guess(i));
+    });
+    team_.barrier();
+    keep_contact_forces(true, [&](std::int64_t i, const Vec3<Wide>& elastic) {
+      w_.work[i] = w_.work[i] + Lanes::narrow(Wide(0.5) * dot(elastic, way(i)));
+    });
+    correct();
+    if (team_.rank == 0) sum_rises();
+    team_.barrier();
+    each_that_moves([&](std::int64_t i) {
+      const auto falls = Lanes::narrow(w_.body_sums[plan_.vertex_component[i]].rise) < Real(T(0));
+      w_.u[i] = w_.before[i] = select(falls, w_.u[i], w_.before[i]);
+    });
+    team_.barrier();
+  }
+
+  // Of every body from the present shape to the guess.
+  void sum_rises() {
+    for (int g = 0; g < plan_.components; ++g) w_.body_sums[g].rise = Wide(0.0);
+    each_in_a_body<Lanes>(plan_, [&](int i, int g) {
+      const Value to = w_.u[i] - w_.target[i], from = w_.before[i] - w_.target[i];
+      const Vec3<Wide> after = widened<Wide>(Lanes::vec3(to)), before = widened<Wide>(Lanes::vec3(from));
+      const Wide inertia = Lanes::widen(w_.inertia[i]) * (dot(after, after) - dot(before, before));
+      Wide& rise = w_.body_sums[g].rise;
+      rise = rise + multiply_add(Wide(0.5), inertia, Lanes::widen(w_.work[i]));
+    });
+  }
+
   Value target(std::int64_t i, const Real& spring, const Value& pin) const {
     const Real h(h_), mass = in_.number(call_.material.masses, plan_.vertex_order[i]);
     const Real weight = inertia_weight(mass, damping_, spring, h);

@@ -1,0 +1,221 @@
+// A contact as an envelope: its force grows from that of the present iterate with the stiffness D of the iteration.
+//
+// With the gap, the slip along the surface since the start of the step, and the forces l0 (normal) and t0 (tangential) at
+// the iterate, for a fixed radius r of friction:
+//   e = max(0, l0 - D gap)^2 / (2 D) + huber_r(t0 - D slip) / D,   huber_r(b) = |b|^2 / 2 if |b| <= r, else r |b| - r^2 / 2
+// e is convex. It is what remains of D / 2 |p|^2 once the contact has pushed its vertex by p = (f - f0) / D, f = l n + t.
+// With min(1, r / |b|) D as tangential stiffness, its quadratic model is an upper bound: Newton's step does not overshoot
+// where friction begins to hold.
+#pragma once
+#include "contact/plane_sphere.h"
+
+namespace pd::inline PD_TARGET {
+
+// Force of a contact on a vertex at the present iterate, and the radius of friction, which lags behind friction times l.
+template <class V, class R>
+struct ContactForce {
+  V force;
+  R radius;
+};
+
+template <class W, class R>
+PD_HD Vec3<W> widened(const Vec3<R>& a) {
+  return {convert<double>(a.x), convert<double>(a.y), convert<double>(a.z)};
+}
+
+// A contact at some displacement of its vertex.
+template <class W>
+struct Surface {
+  Vec3<W> normal;
+  W gap;
+  Vec3<W> slip;
+};
+
+template <class W>
+struct Envelope {
+  W stiffness, normal_anchor;
+  Vec3<W> tangent_anchor;
+
+  // `force`: of the contact at the iterate; `normal`: along which it is split
+  PD_HD Envelope(const W& stiffness, const Vec3<W>& force, const Vec3<W>& normal)
+      : stiffness(stiffness), normal_anchor(dot(force, normal)) {
+    normal_anchor = select(normal_anchor > W(0.0), normal_anchor, W(0.0));
+    tangent_anchor = tangential(force, normal);
+  }
+
+  PD_HD W normal_force(const W& gap) const {
+    const W force = subtract_product(normal_anchor, stiffness, gap);
+    return select(force > W(0.0), force, W(0.0));
+  }
+
+  // b = t0 - D slip, and the share of it that the radius leaves
+  struct Rub {
+    Vec3<W> pull;
+    W square, share;
+  };
+
+  PD_HD Rub rub(const Vec3<W>& slip, const W& radius) const {
+    const Vec3<W> pull = subtract_product(tangent_anchor, stiffness, slip);
+    const W square = dot(pull, pull), size = square_root(square);
+    const auto cut = size > radius;
+    return {pull, square, select(cut, radius / select(cut, size, W(1.0)), W(1.0))};
+  }
+
+  // the force at the iterate
+  PD_HD Vec3<W> anchor(const Vec3<W>& normal) const {
+    return multiply_add(normal_anchor, normal, tangent_anchor);
+  }
+
+  PD_HD W energy(const Surface<W>& at, const W& radius) const {
+    const W normal = normal_force(at.gap);
+    const Rub r = rub(at.slip, radius);
+    const W huber = r.share * (W(1.0) - W(0.5) * r.share) * r.square;
+    return multiply_add(W(0.5) * normal, normal, huber) / stiffness;
+  }
+
+  PD_HD Vec3<W> force(const Surface<W>& at, const W& radius) const {
+    const Rub r = rub(at.slip, radius);
+    return multiply_add(normal_force(at.gap), at.normal, r.share * r.pull);
+  }
+};
+
+// Sums over the contacts of a body: of their energies before and after a motion, of the second derivative and the force by
+// the twist after it, and of the squares of friction l - r and of r.
+struct ContactSums {
+  static constexpr int before = 0, after = 1, matrix = 2, force = 23, lag = 29, radius = 30, count = 31;
+  // the lower triangle, row by row
+  PD_HD static constexpr int at(int row, int column) { return matrix + row * (row + 1) / 2 + column; }
+};
+
+// Adds J^T k J and J^T f: k = `across` (1 - n n^T) + `along` n n^T, J the displacement of a vertex at `arm` by a twist, n = `normal`.
+template <class W>
+PD_HD void add_twist_terms(W (&sum)[ContactSums::count], const Vec3<W>& arm, const Vec3<W>& normal,
+                           const Vec3<W>& force, const W& across, const W& along) {
+  using S = ContactSums;
+  const Vec3<W> moment = cross(arm, force), lever = cross(arm, normal);
+  const W f[6] = {force.x, force.y, force.z, moment.x, moment.y, moment.z};
+  const W n[6] = {normal.x, normal.y, normal.z, lever.x, lever.y, lever.z};
+  const W none(0.0), square = dot(arm, arm), r[3] = {arm.x, arm.y, arm.z};
+  // arm x
+  const W x[3][3] = {{none, -arm.z, arm.y}, {arm.z, none, -arm.x}, {-arm.y, arm.x, none}};
+  const W more = along - across;
+  for (int i = 0; i < 6; ++i) {
+    sum[S::force + i] = sum[S::force + i] + f[i];
+    const W scaled = more * n[i];
+    for (int j = 0; j <= i; ++j) {
+      const W plain = i < 3   ? (i == j ? across : none)
+                      : j < 3 ? across * x[i - 3][j]
+                      : i == j ? across * (square - r[i - 3] * r[i - 3])
+                               : -(across * (r[i - 3] * r[j - 3]));
+      sum[S::at(i, j)] = multiply_add(scaled, n[j], sum[S::at(i, j)] + plain);
+    }
+  }
+}
+
+// A vertex of a body that moves, in double: its position at the start of the step, its displacement at the iterate, and D.
+template <class W>
+struct CoarseVertex {
+  Vec3<W> x, u;
+  W stiffness;  // 0: a pin holds it
+};
+
+template <class W>
+PD_HD Surface<W> surface_at(const Plane<W>& plane, const Vec3<W>& x, const Vec3<W>& u) {
+  return {plane.normal, gap(plane, x + u), tangential(u, plane.normal)};
+}
+
+template <class W>
+PD_HD Surface<W> surface_at(const Sphere<W>& sphere, const Vec3<W>& x, const Vec3<W>& u) {
+  const Vec3<W> normal = outward(sphere, x + u);
+  return {normal, gap(sphere, x + u), tangential(u - sphere.motion, normal)};
+}
+
+// Calls visit(n, plane or sphere in double) for contact n.
+template <class W, class R, class Visit>
+PD_HD void each_contact(const Contacts<R>& contacts, const Visit& visit) {
+  for (int i = 0; i < contacts.plane_count; ++i) {
+    const Plane<R>& p = contacts.planes[i];
+    visit(i, Plane<W>{widened<W>(p.normal), convert<double>(p.height), convert<double>(p.friction)});
+  }
+  for (int i = 0; i < contacts.sphere_count; ++i) {
+    const Sphere<R>& s = contacts.spheres[i];
+    visit(contacts.plane_count + i, Sphere<W>{widened<W>(s.center), widened<W>(s.motion),
+                                              convert<double>(s.radius), convert<double>(s.friction)});
+  }
+}
+
+// Keeps the forces with which the contacts stop a plain iteration at `free`.
+template <class R, class W, class Forces>
+PD_HD void keep_forces(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Vec3<W>& free,
+                       const Forces& forces) {
+  const W none(0.0);
+  Vec3<W> at = free;
+  each_contact<W>(contacts, [&](int n, const auto& shape) {
+    const Vec3<W> next = project(shape, v.x, at, v.u);
+    const Vec3<W> force = v.stiffness * (next - at);
+    const W normal = dot(force, surface_at(shape, v.x, v.u).normal);
+    forces.set(n, force, select(normal > none, shape.friction * normal, none));
+    at = next;
+  });
+}
+
+// How far the contacts push a vertex once its body has moved: (f - f0) / D.
+template <class R, class W, class Forces>
+PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
+  const W none(0.0), one(1.0), inverse = select(v.stiffness > none, one / select(v.stiffness > none, v.stiffness, one), none);
+  Vec3<W> push = {none, none, none};
+  each_contact<W>(contacts, [&](int n, const auto& shape) {
+    const Surface<W> at = surface_at(shape, v.x, v.u);
+    const Vec3<W> before = forces.force(n);
+    const Envelope<W> envelope(select(v.stiffness > none, v.stiffness, one), before, at.normal);
+    push = push + inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
+  });
+  return push;
+}
+
+// What a round asks of a body's vertices: displacements `before` and `after`, and the arms after. `renews`: radii move
+// half way to friction l. All per environment.
+template <class W>
+struct CoarseTrial {
+  Mat3<W> turn_before, turn_after;  // R - I
+  Vec3<W> center, shift_before, shift_after;
+  W renews;  // 0.5, or 0
+};
+
+// Adds the contacts of a vertex. `forces[n stride]`: ContactForce of contact n.
+template <class R, class W, class Forces>
+PD_HD void add_contacts(W (&sum)[ContactSums::count], const Contacts<R>& contacts,
+                        const CoarseVertex<W>& v, const CoarseTrial<W>& trial, const Forces& forces) {
+  using S = ContactSums;
+  const Vec3<W> arm = (v.x + v.u) - trial.center;
+  const Vec3<W> first = v.u + (trial.turn_before * arm + trial.shift_before);
+  const Vec3<W> way = trial.turn_after * arm, then = v.u + (way + trial.shift_after);
+  const W none(0.0), free = select(v.stiffness > none, W(1.0), none);
+  const W stiffness = select(v.stiffness > none, v.stiffness, W(1.0));
+  each_contact<W>(contacts, [&](int n, const auto& shape) {
+    const Surface<W> before = surface_at(shape, v.x, first), after = surface_at(shape, v.x, then);
+    const W friction = shape.friction;
+    const Vec3<W> force = forces.force(n);
+    W radius = forces.radius(n);
+    // by the normal of before, so that both energies are of one function
+    const Envelope<W> old(stiffness, force, before.normal);
+    const Surface<W> there = {before.normal, after.gap, before.slip + tangential(then - first, before.normal)};
+    const Envelope<W> now(stiffness, force, after.normal);
+    const W normal = now.normal_force(after.gap);
+    if (!any(((old.normal_force(before.gap) + normal) + radius) + dot(force, force) > none)) return;
+    sum[S::before] = multiply_add(free, old.energy(before, radius), sum[S::before]);
+    sum[S::after] = multiply_add(free, old.energy(there, radius), sum[S::after]);
+    radius = multiply_add(trial.renews, friction * normal - radius, radius);
+    forces.set_radius(n, radius);
+    const W lag = friction * normal - radius;
+    sum[S::lag] = multiply_add(free * lag, lag, sum[S::lag]);
+    sum[S::radius] = multiply_add(free * radius, radius, sum[S::radius]);
+    const auto rub = now.rub(after.slip, radius);
+    const W across = free * (rub.share * stiffness);
+    const W along = select(normal > none, free * stiffness, none);
+    const Vec3<W> pull = free * multiply_add(normal, after.normal, rub.share * rub.pull);
+    add_twist_terms(sum, arm + way, after.normal, pull, across, along);
+  });
+}
+
+}  // namespace pd::inline PD_TARGET
