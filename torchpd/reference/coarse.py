@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,16 +29,17 @@ from .geometry import twists
 if TYPE_CHECKING:
     from .problem import StepProblem
 
-__all__ = ["Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
+__all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-PASSES = 16  # Newton passes of an outer step
-SETTLE = 4  # minimisations of an outer step, between which friction radii go half of the way to friction l
-HALVINGS = 8
+PASSES = 32  # accepted steps of Newton's method
+CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-EXACT = 1e-12  # rounding: relative change of an energy, and motion over the size of a body, that count as none
+STILL = 1e-6  # of the size of a body, and of the friction radii: a step that ends the passes
+NEAR = 1e-3  # of the size: a step within which friction radii move half way to friction l
+ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,6 @@ class Motions(ABC):
         """[n] vertices without hard pins of the island."""
         return np.concatenate(self.free)
 
-    @cached_property
-    def size(self) -> float:
-        """Extent of the largest body [m]."""
-        return max(float(np.ptp(self.problem.positions[body], axis=0).max()) for body in self.bodies)
-
     @property
     @abstractmethod
     def modes(self) -> Array:
@@ -81,6 +77,15 @@ class Motions(ABC):
     @abstractmethod
     def hessian(self) -> Array:
         """Second derivative [N, N] by the motions, positive definite."""
+
+    @property
+    @abstractmethod
+    def scale(self) -> float:
+        """The energy [J] that moves the island by its size."""
+
+    @abstractmethod
+    def share(self, motion: Array) -> float:
+        """Motions [N] over the size of the island."""
 
     @abstractmethod
     def after(self, motion: Array) -> Self:
@@ -160,6 +165,21 @@ class RigidMotions(Motions):
                 hessian[columns, columns] = exact
         return np.asarray(hessian)
 
+    @property
+    def scale(self) -> float:
+        """Sum of a |arm|^2 [J]."""
+        weight = self.problem.weight
+        return sum(float(weight[own] @ (arms**2).sum(axis=1)) for own, arms, *_ in self.parts)
+
+    def share(self, motion: Array) -> float:
+        """Largest of |v| / l + |w| over the bodies, l^2 the mean of |arm|^2 by a."""
+        shares = [0.0]
+        for own, arms, basis, _, columns in self.parts:
+            weight, twist = self.problem.weight[own], basis @ motion[columns]
+            size = float(np.sqrt(weight @ (arms**2).sum(axis=1) / weight.sum()))
+            shares.append(float(np.linalg.norm(twist[:3])) / size + float(np.linalg.norm(twist[3:])))
+        return max(shares)
+
     def after(self, motion: Array) -> RigidMotions:
         """The same after finite motions along the twists [N]; hard pins stay."""
         displacement = self.displacement.copy()
@@ -178,6 +198,14 @@ class RigidMotions(Motions):
 MotionsOf = Callable[["StepProblem", Array, tuple[Index, ...]], Motions]
 
 
+class Correction(NamedTuple):
+    """What a coarse correction leaves."""
+
+    displacement: Array  # [V, 3] m
+    forces: Array  # [m, 3] N of the pairs
+    energies: Array  # [components] J: Phi of its island, before the pushes; inf where pins leave no motion
+
+
 def correct(
     problem: StepProblem,
     displacement: Array,
@@ -185,8 +213,8 @@ def correct(
     pairs: PairContacts | None = None,
     *,
     motions: MotionsOf = RigidMotions,
-) -> tuple[Array, Array]:
-    """The coarse correction of every island: displacement [V, 3] m, and forces [m, 3] N of the pairs after it.
+) -> Correction:
+    """The coarse correction of every island.
 
     Args:
         problem: the step.
@@ -196,11 +224,15 @@ def correct(
         motions: makes the motions of an island.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
+    energies = np.full(int(problem.values.component.max()) + 1, np.inf)
     for bodies, of in islands(problem, pairs):
-        own = None if pairs is None or not len(of) else pairs.chosen(of)
-        corrected, each = _correct_island(motions(problem, corrected, bodies), forces, own)
+        own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
+        if not moving.modes.shape[2]:
+            continue
+        corrected, each, energy = _correct_island(moving, forces, own)
         after[of] = each[len(each) - len(of) :]
-    return corrected, after
+        energies[problem.values.component[[body[0] for body in bodies]]] = energy
+    return Correction(corrected, after, energies)
 
 
 def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
@@ -216,39 +248,36 @@ def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array]:
-    """Displacement [V, 3] m and forces [m, 3] N of all contacts after the correction."""
+def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, float]:
+    """Displacement [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
-    for _ in range(PASSES if motions.modes.shape[2] else 0):
+    phi = motions.energy + contacts.energy(radius)
+    for _ in range(PASSES):
         step = _newton_step(motions, contacts, radius)
-        energy, moved = motions.energy + contacts.energy(radius), 0.0
-        for _ in range(HALVINGS):
-            trial = motions.after(step)
+        for attempt in range(2 * CUTS + 2):
+            again = attempt % 2 == 1  # on from the trial, whose contacts the first step did not see
+            more = _newton_step(trial, after, radius) if again else step
+            trial = (trial if again else motions).after(more)
             after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
             way = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
-            reached = trial.energy + replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
-            if reached <= energy + EXACT * abs(energy):
-                moved = np.abs(trial.displacement - motions.displacement).max()
-                motions, contacts = trial, after
+            energy = contacts.energy(radius)
+            reached = replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
+            share = motions.share(more) + (share if again else 0.0)
+            if share <= NEAR:
+                radius = radius + 0.5 * (after.friction * after.normal_forces() - radius)
+            rise = reached - energy + trial.energy - motions.energy
+            if rise <= ROUNDING * (motions.scale + energy):
                 break
-            step = 0.5 * step
-        STATS[0] += 1
-        lag = contacts.friction * contacts.normal_forces() - radius
-        if moved < STILL * motions.size and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
+            step = 0.5 * step if again else step
+        else:
             break
-        if moved < WAIT * motions.size:
-            radius = radius + SHARE * lag
-    STATS[1] += 1; STATS[2] = max(STATS[2], STATS[0] - STATS[3]); STATS[3] = STATS[0]
-    return _pushed(motions, contacts, radius), contacts.forces(radius)
-
-
-STATS = [0, 0, 0, 0]
-STILL = 1e-6
-SHARE = 0.5
-LAST = 1
-WAIT = 1e-3
+        motions, contacts, phi = trial, after, trial.energy + reached
+        lag = after.friction * after.normal_forces() - radius
+        if share <= STILL and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
+            break
+    return _pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
 def _newton_step(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
@@ -256,7 +285,8 @@ def _newton_step(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
     jacobian, second = motions.jacobian(contacts), contacts.second_derivatives(radius)
     on = second.any(axis=(1, 2))
     matrix = motions.hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-    return np.linalg.solve(matrix, np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient)
+    force = np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient
+    return np.asarray(np.linalg.solve(matrix, force))
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
@@ -266,7 +296,7 @@ def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
     each = contacts.weights[:, :, None] * (contacts.forces(radius) - before)[:, None, :]
     forces = np.zeros_like(motions.displacement)
     np.add.at(forces, contacts.vertices.reshape(-1), each.reshape(-1, 3))
-    pushed = motions.displacement + np.where(problem.free[:, None], forces / problem.weighted_diagonal[:, None], 0.0)
+    pushed = motions.displacement + np.where(problem.free[:, None], forces / problem.diagonal[:, None], 0.0)
     moved, own = motions.displacement.copy(), np.concatenate(motions.bodies)
     moved[own] = problem.project(pushed)[own]
     return moved
@@ -289,8 +319,7 @@ def _curvature(left: Array, arms: Array) -> Array:
 
 
 def _finite(twist: Array, arms: Array) -> Array:
-    """Finite displacement [n, 3] of points at arms [n, 3] by a twist (v, w): (exp [w]x - 1) r + v."""
-    w, angle = _cross(twist[3:]), float(np.linalg.norm(twist[3:]))
-    half = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2  # (1 - cos angle) / angle^2
-    turn = np.sinc(angle / np.pi) * w + half * w @ w
+    """Displacement of arms [n, 3] by a twist (v, w): (R - 1) r + v, R the turn about w by 2 atan(|w| / 2) (Cayley)."""
+    half = _cross(0.5 * twist[3:])
+    turn = 2.0 / (1.0 + 0.25 * float(twist[3:] @ twist[3:])) * (half + half @ half)
     return np.asarray(arms @ turn.T + twist[:3])

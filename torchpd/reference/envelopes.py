@@ -134,7 +134,7 @@ def contacts_at(
         weights = np.concatenate([np.pad(weights, ((0, 0), (0, 3))), pairs.weights])
         anchors = np.concatenate([anchors, pairs.forces])
     normal = np.concatenate(normals)
-    inverse = np.where(problem.free[index], weights**2 / problem.weighted_diagonal[index], 0.0).sum(axis=1)
+    inverse = np.where(problem.free[index], weights**2 / problem.diagonal[index], 0.0).sum(axis=1)
     contacts = Envelopes(
         vertices=index,
         weights=weights,
@@ -152,7 +152,7 @@ def contacts_at(
 
 def pushes_of(problem: StepProblem, displacement: Array, gradient: Array) -> Array:
     """Forces [C, V, 3] N of every plane and sphere in the next plain iteration: D times what P(u - g / D) moves."""
-    scale = problem.weighted_diagonal[:, None]
+    scale = problem.diagonal[:, None]
     before, forces = displacement - gradient / scale, []
     for after in problem.projections(before, displacement):
         forces.append(np.where(problem.free[:, None], scale * (after - before), 0.0))

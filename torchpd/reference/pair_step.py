@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .coarse import MotionsOf, RigidMotions, correct
-from .coarse_step import rigid_fit
 from .envelopes import Envelopes, PairContacts, contacts_at, pushes_of
 from .piece_step import piece_motions
 from .pieces import Pieces, PieceSpace
@@ -73,13 +72,12 @@ def pair_chebyshev(
 
 
 def _first(problem: StepProblem, pairs: PairContacts) -> tuple[Array, PairContacts]:
-    """The bodies in their present shape on their rigid course, corrected with the forces of the last step."""
+    """The bodies in their present shape, corrected with the forces of the last step."""
     still = problem.project(problem.hold(np.zeros_like(problem.positions)))
     pull = np.where(problem.free[:, None], problem.weight[:, None] * (still - problem.target), 0.0)
     forces = pushes_of(problem, still, problem.gradient(still) - pull)
-    course = rigid_fit(problem, still, problem.hold(problem.time_step * problem.velocities))
-    moved, after = correct(problem, course, forces, pairs)
-    return moved, replace(pairs, forces=after)
+    moved = correct(problem, still, forces, pairs)
+    return moved.displacement, replace(pairs, forces=moved.forces)
 
 
 def corrected_pairs(
@@ -88,8 +86,8 @@ def corrected_pairs(
     """Displacement [V, 3] m and pairs after a coarse correction."""
     # the forces of planes answer the elastic forces and those of the pairs
     gradient = problem.gradient(displacement) - nodal(problem, pairs, pairs.forces)
-    moved, after = correct(problem, displacement, pushes_of(problem, displacement, gradient), pairs, motions=motions)
-    return moved, replace(pairs, forces=after)
+    moved = correct(problem, displacement, pushes_of(problem, displacement, gradient), pairs, motions=motions)
+    return moved.displacement, replace(pairs, forces=moved.forces)
 
 
 def nodal(problem: StepProblem, pairs: PairContacts, forces: Array) -> Array:

@@ -27,7 +27,6 @@ class PieceMotions(Motions):
     """Motions Z q of the pieces of one island, and E with the Hessian Hc where the space was made."""
 
     space: PieceSpace
-    way: Array | None = None  # [N] motions from where the space was made
 
     @cached_property
     def columns(self) -> Index:
@@ -47,6 +46,14 @@ class PieceMotions(Motions):
     @cached_property
     def hessian(self) -> Array:
         return np.asarray(self.space.hessian[np.ix_(self.columns, self.columns)])
+
+    @property
+    def scale(self) -> float:
+        return abs(self.energy)
+
+    def share(self, motion: Array) -> float:
+        size = max(float(np.ptp(self.problem.positions[body], axis=0).max()) for body in self.bodies)
+        return float(np.abs(self.modes @ motion).max(initial=0.0)) / size
 
     def after(self, motion: Array) -> PieceMotions:
         displacement = self.displacement.copy()

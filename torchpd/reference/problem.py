@@ -16,7 +16,7 @@ nu = 0, w / 2 |F - R|^2 with R the nearest rotation. Hard pins hold u_i = target
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -25,11 +25,9 @@ from scipy.sparse import csr_array, diags_array
 
 from ..common.tables import PLANES, SPHERES
 from ..scene.scene import SceneValues
-from .geometry import sphere_normals
+from .geometry import gaps_of, sphere_normals
 from .groups import ElementGroup, groups_of
-from .rigid import align, begin
-from .rigid_piece import gaps_of
-from .rotations import nearest_rotation
+from .rigid import corrected, first_iterate
 
 __all__ = ["StepProblem", "elastic_energy", "kinetic_energy", "potential_energy", "step_problem"]
 
@@ -50,6 +48,7 @@ class StepProblem:
     free: Mask  # [V] not hard-pinned
     sphere_centers: Array  # [S, 3] at the end of the step
     sphere_motions: Array  # [S, 3] displacement of the centres during the step
+    weighted: bool = True  # whether `diagonal` has the bounds of the elements
 
     @cached_property
     def groups(self) -> tuple[ElementGroup, ...]:
@@ -65,6 +64,15 @@ class StepProblem:
     def weighted_diagonal(self) -> Array:
         """Dbar_i = a_i + sum_e (q_e l_e + n k_e) V_e |g_i|^2 [V], N/m: no step 1.9 Dbar^-1 grad E raises E."""
         return self.weight + sum(group.weighted_diagonal for group in self.groups)
+
+    @property
+    def diagonal(self) -> Array:
+        """D [V], N/m, of iterations and coarse corrections."""
+        return self.weighted_diagonal if self.weighted else self.plain_diagonal
+
+    def with_diagonal(self, *, weighted: bool) -> StepProblem:
+        """The same with the weighted or the plain diagonal."""
+        return self if weighted == self.weighted else replace(self, weighted=weighted)
 
     @cached_property
     def matrix(self) -> csr_array:
@@ -140,20 +148,17 @@ class StepProblem:
             products |= group.material_rows(rates)
         return products
 
-    def first_iterate(self, start: str | Array = "velocity", *, weighted: bool = True) -> Array:
-        """u_0 [V, 3] m with pins at their targets, contacts projected and rigid motions applied.
+    def first_iterate(self, start: str | Array = "velocity") -> Array:
+        """u_0 [V, 3] m with pins at their targets and out of contacts.
 
-        `start` is "velocity" (h v), "inertial" (s) or positions [V, 3]. With a named start, a component keeps its
-        current position where the contacts would squeeze it by more energy than the motion gains (`begin`).
-        `weighted` chooses the diagonal that the iterations use.
+        `start` is "velocity" (h v), "inertial" (s) or positions [V, 3]. With a named start every body takes that guess
+        or its present shape, after a coarse correction (`reference.rigid`).
         """
         if isinstance(start, str):
             guesses = {"velocity": self.time_step * self.velocities, "inertial": self.target}
             if start not in guesses:
                 raise ValueError(f'start must be "velocity", "inertial" or positions [V, 3], got "{start}"')
-            guess = self.hold(guesses[start])
-            begun = begin(self, guess, self.weighted_diagonal if weighted else self.plain_diagonal)
-            return self.align(begun, first=True)
+            return first_iterate(self, guesses[start])
         guess = self.hold(np.asarray(start, dtype=np.float64) - self.positions)
         return self.project(guess, guess)
 
@@ -165,9 +170,9 @@ class StepProblem:
     def hold(self, displacement: Array) -> Array:
         return np.where(self.free[:, None], displacement, self.target)
 
-    def align(self, displacement: Array, *, first: bool = False) -> Array:
-        """Move every component rigidly to the least E that its pins and contacts allow."""
-        return align(self, displacement, nearest_rotation, first=first)
+    def align(self, displacement: Array) -> Array:
+        """The coarse correction of a displacement [V, 3] m."""
+        return corrected(self, displacement)
 
     def smallest_gap(self, displacement: Array) -> Array:
         """Signed distance [V] m of every vertex to the nearest contact surface; inf without contacts."""
@@ -200,8 +205,8 @@ class StepProblem:
             yield moved
 
     def residual(self, displacement: Array, diagonal: Array | None = None) -> Array:
-        """D (u - P(u - g / D)) [V, 3] N: zero at a solution, grad E where nothing touches; D is Dbar by default."""
-        scale = (self.weighted_diagonal if diagonal is None else diagonal)[:, None]
+        """D (u - P(u - g / D)) [V, 3] N: zero at a solution, grad E where nothing touches; `diagonal` by default."""
+        scale = (self.diagonal if diagonal is None else diagonal)[:, None]
         stepped = displacement - self.gradient(displacement) / scale
         return np.asarray(scale * (displacement - self.project(stepped, displacement)))
 

@@ -53,10 +53,9 @@ struct VertexForces {
   void set_radius(int n, const Wide& radius) const {
     w.friction_radius[std::int64_t(n) * vertices + i] = Lanes::narrow(radius);
   }
-  void set(int n, const Vec3<Wide>& force, const Wide& radius) const {
+  void set(int n, const Vec3<Wide>& force) const {
     w.contact_force[std::int64_t(n) * vertices + i] = Lanes::value(
         {Lanes::narrow(force.x), Lanes::narrow(force.y), Lanes::narrow(force.z)});
-    set_radius(n, radius);
   }
 };
 
@@ -129,9 +128,11 @@ void find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
     double sum[RigidSums::count];
     read_lane<RigidSums::count, Lanes>(w.body_sums[n / lanes].rigid, n % lanes, sum);
     w.bodies[n] = CoarseBody(RigidBody(sum));
+    put_lane<Lanes>(w.body_sums[n / lanes].moves, n % lanes, w.bodies[n].moves() ? 1.0 : 0.0);
     if constexpr (!HasContacts) w.bodies[n].move_free();
   }
-  for (bool some = HasContacts; some;) {
+  bool some = HasContacts;
+  while (some) {
     some = false;
     for (int g = 0; g < plan.components; ++g) {
       w.body_sums[g].goes_on = set_trial(w, g);

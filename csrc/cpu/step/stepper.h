@@ -86,14 +86,11 @@ class Stepper {
     const bool first = !started_;
     started_ = true;
     if (plan_.components == 0 || (first && set_.start() == StartKind::given)) return;
+    if (first) return choose_first_iterate();
     if constexpr (HasContacts) {
-      if (first) return choose_first_iterate();
-      keep_contact_forces(true, [](std::int64_t, const Vec3<Wide>&) {});
+      each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force, Wide(1.0)); });
     }
     correct();
-    if (!first) return;
-    each_that_moves([&](std::int64_t i) { w_.before[i] = w_.u[i]; });
-    team_.barrier();
   }
 
   // The guess that the first iterate is made from.
@@ -148,20 +145,23 @@ class Stepper {
     }
   }
 
-  // Keeps the forces with which contacts answer the gradient of E at u; `full`: with inertia. Then visit(vertex, elastic force).
+  // visit(vertex, elastic force) for every vertex of a body that moves
   template <class Visit>
-  void keep_contact_forces(bool full, const Visit& visit) {
-    const Wide inertial(full ? 1.0 : 0.0);
+  void each_elastic_force(const Visit& visit) {
     sweep_.run(0, elastic_gradient<false>(), [&](std::int64_t i, const Value& force, Sum&) {
-      if (plan_.vertex_component[i] < 0) return;
-      const CoarseVertex<Wide> v = coarse_vertex(w_, i);
-      const Vec3<Wide> elastic = widened<Wide>(Lanes::vec3(force));
-      const Vec3<Wide> offset = v.u - widened<Wide>(Lanes::vec3(w_.target[i]));
-      const Vec3<Wide> gradient = multiply_add(inertial * Lanes::widen(w_.inertia[i]), offset, elastic);
-      const Vec3<Wide> free = subtract_product(v.u, Lanes::widen(w_.inverse[i]), gradient);
-      pd::keep_forces(contacts_, v, free, VertexForces<Lanes>{w_, plan_.vertices, int(i)});
-      visit(i, elastic);
+      if (plan_.vertex_component[i] >= 0) visit(i, widened<Wide>(Lanes::vec3(force)));
     });
+  }
+
+  VertexForces<Lanes> forces_of(std::int64_t i) const { return {w_, plan_.vertices, int(i)}; }
+
+  // Keeps the forces with which the contacts answer the gradient of E; `inertial`: 1, or 0 without inertia.
+  void keep_forces(std::int64_t i, const Vec3<Wide>& elastic, const Wide& inertial) {
+    const CoarseVertex<Wide> v = coarse_vertex(w_, i);
+    const Vec3<Wide> offset = v.u - widened<Wide>(Lanes::vec3(w_.target[i]));
+    const Vec3<Wide> gradient = multiply_add(inertial * Lanes::widen(w_.inertia[i]), offset, elastic);
+    const Vec3<Wide> free = subtract_product(v.u, Lanes::widen(w_.inverse[i]), gradient);
+    pd::keep_forces(contacts_, v, free, forces_of(i));
   }
 
   // Moves every body by its rigid motion with the least energy, and then each vertex by what the contacts still push.
@@ -178,51 +178,71 @@ class Stepper {
       if constexpr (HasContacts) {
         v.u = widened<Wide>(Lanes::vec3(u));
         u = vertex(i).displaced(
-            u, narrowed(push_of(contacts_, v, VertexForces<Lanes>{w_, plan_.vertices, int(i)})));
+            u, narrowed(push_of(contacts_, v, forces_of(i))));
         u = vertex(i).project(contacts_, u, u);
       }
-      w_.u[i] = u;
+      const Wide moves = w_.body_sums[plan_.vertex_component[i]].moves;
+      w_.u[i] = select(Lanes::narrow(moves) > Real(T(0)), u, w_.u[i]);
     });
     team_.barrier();
   }
 
-  // Both first iterates are corrected: the present shape by the contacts' answer to the elastic forces alone, and the guess. The one
-  // of less energy stays. Elastic energies differ by the work of the mean of both elastic forces, which rigid motions do not change.
+  Value present_iterate(std::int64_t i) const { return vertex(i).current_iterate(contacts_); }
+  Value guessed_iterate(std::int64_t i) const { return vertex(i).first_iterate(contacts_, guess(i)); }
+
+  // The present shape and the guess are both corrected, with the forces by which the contacts answer the elastic forces of the former.
+  // The one with the lower Phi stays. Elastic energies differ by the work of the mean elastic force, which rigid motions do not change.
   void choose_first_iterate() {
-    const auto way = [&](std::int64_t i) {
-      return widened<Wide>(Lanes::vec3(vertex(i).first_iterate(contacts_, guess(i)))) -
-             widened<Wide>(Lanes::vec3(vertex(i).current_iterate(contacts_)));
+    const auto add_work = [&](std::int64_t i, const Vec3<Wide>& force) {
+      const Vec3<Wide> way = widened<Wide>(Lanes::vec3(guessed_iterate(i))) -
+                             widened<Wide>(Lanes::vec3(present_iterate(i)));
+      w_.work[i] = w_.work[i] + Lanes::narrow(Wide(0.5) * dot(force, way));
     };
-    each_that_moves([&](std::int64_t i) { w_.u[i] = vertex(i).current_iterate(contacts_); });
+    each_that_moves([&](std::int64_t i) {
+      w_.u[i] = present_iterate(i);
+      w_.work[i] = Real(T(0));
+    });
     team_.barrier();
-    keep_contact_forces(false, [&](std::int64_t i, const Vec3<Wide>& elastic) {
-      w_.work[i] = Lanes::narrow(Wide(0.5) * dot(elastic, way(i)));
+    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) {
+      add_work(i, force);
+      if constexpr (HasContacts) keep_forces(i, force, Wide(0.0));
     });
     correct();
+    if (team_.rank == 0) {
+      for (int n = 0; n < plan_.components * width; ++n) w_.reached[n] = w_.bodies[n].reached();
+    }
     each_that_moves([&](std::int64_t i) {
       w_.before[i] = w_.u[i];
-      w_.u[i] = vertex(i).first_iterate(contacts_, guess(i));
+      w_.u[i] = guessed_iterate(i);
     });
     team_.barrier();
-    keep_contact_forces(true, [&](std::int64_t i, const Vec3<Wide>& elastic) {
-      w_.work[i] = w_.work[i] + Lanes::narrow(Wide(0.5) * dot(elastic, way(i)));
+    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) {
+      add_work(i, force);
+      if constexpr (HasContacts) restart_radii(contacts_, coarse_vertex(w_, i), forces_of(i));
     });
     correct();
     if (team_.rank == 0) sum_rises();
     team_.barrier();
     each_that_moves([&](std::int64_t i) {
-      const auto falls = Lanes::narrow(w_.body_sums[plan_.vertex_component[i]].rise) < Real(T(0));
-      w_.u[i] = w_.before[i] = select(falls, w_.u[i], w_.before[i]);
+      const BodySums<Wide>& body = w_.body_sums[plan_.vertex_component[i]];
+      const auto stays = Lanes::narrow(body.moves) > Real(T(0)) && !(Lanes::narrow(body.rise) < Real(T(0)));
+      w_.u[i] = w_.before[i] = select(stays, w_.before[i], w_.u[i]);
     });
     team_.barrier();
   }
 
-  // Of every body from the present shape to the guess.
+  // Of every body, from the present shape to the guess.
   void sum_rises() {
-    for (int g = 0; g < plan_.components; ++g) w_.body_sums[g].rise = Wide(0.0);
+    for (int g = 0; g < plan_.components; ++g) {
+      for (int lane = 0; lane < width; ++lane) {
+        const int n = g * width + lane;
+        put_lane<Lanes>(w_.body_sums[g].rise, lane, w_.bodies[n].reached() - w_.reached[n]);
+      }
+    }
     each_in_a_body<Lanes>(plan_, [&](int i, int g) {
-      const Value to = w_.u[i] - w_.target[i], from = w_.before[i] - w_.target[i];
-      const Vec3<Wide> after = widened<Wide>(Lanes::vec3(to)), before = widened<Wide>(Lanes::vec3(from));
+      const Vec3<Wide> target = widened<Wide>(Lanes::vec3(w_.target[i]));
+      const Vec3<Wide> after = widened<Wide>(Lanes::vec3(guessed_iterate(i))) - target,
+                       before = widened<Wide>(Lanes::vec3(present_iterate(i))) - target;
       const Wide inertia = Lanes::widen(w_.inertia[i]) * (dot(after, after) - dot(before, before));
       Wide& rise = w_.body_sums[g].rise;
       rise = rise + multiply_add(Wide(0.5), inertia, Lanes::widen(w_.work[i]));

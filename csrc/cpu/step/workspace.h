@@ -27,7 +27,8 @@ template <class Wide>
 struct BodySums {
   Wide rigid[RigidSums::count], contact[ContactSums::count];
   Vec3<Wide> center;
-  Wide rise;     // of the energy, from one first iterate to the other
+  Wide moves;    // 1, or 0 where pins clamp it
+  Wide rise;     // of the energy, from the first to the second first iterate
   bool goes_on;  // in some environment
 };
 
@@ -54,9 +55,10 @@ struct Workspace {
   CoarseBody* bodies;          // [components, environments]
   CoarseTrial<Wide>* trial;    // [components]
   RigidMotion<Wide>* motion;   // [components]
-  // with contacts: forces and radii [contacts, vertices], and the work of elastic forces between both first iterates
-  Value* contact_force;
-  Real *friction_radius, *work;
+  double* reached;             // [components, environments] Phi of the first of both first iterates
+  Real* work;                  // [vertices] of the mean elastic force, from the first to the second
+  Value* contact_force;        // [contacts, vertices], like the next
+  Real* friction_radius;
   Plane<Real>* planes;
   Sphere<Real>* spheres;
   // [elements], or [elements, W] when stiffness differs between environments: w V, where w is Young's modulus, or 2 mu
@@ -130,12 +132,13 @@ struct Workspace {
     place(body_sums, plan.components, base);
     place(bodies, plan.components * Lanes::environments, base);
     place(motion, plan.components, base);
+    place(reached, plan.components * Lanes::environments, base);
+    place(work, plan.components > 0 ? plan.vertices : 0, base);
     const std::int64_t contacts =
         plan.components > 0 ? material.planes_count + material.spheres_count : 0;
     place(trial, contacts > 0 ? plan.components : 0, base);
     place(contact_force, contacts * plan.vertices, base);
     place(friction_radius, contacts * plan.vertices, base);
-    place(work, contacts > 0 ? plan.vertices : 0, base);
     place(planes, material.planes_count, base);
     place(spheres, material.spheres_count, base);
     const std::int64_t weights =

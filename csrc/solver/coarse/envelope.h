@@ -144,19 +144,28 @@ PD_HD void each_contact(const Contacts<R>& contacts, const Visit& visit) {
   }
 }
 
+// Begins anew with the same forces at another displacement u.
+template <class R, class W, class Forces>
+PD_HD void restart_radii(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
+  const W none(0.0);
+  each_contact<W>(contacts, [&](int n, const auto& shape) {
+    const W normal = dot(forces.force(n), surface_at(shape, v.x, v.u).normal);
+    forces.set_radius(n, select(normal > none, shape.friction * normal, none));
+  });
+}
+
 // Keeps the forces with which the contacts stop a plain iteration at `free`.
 template <class R, class W, class Forces>
 PD_HD void keep_forces(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Vec3<W>& free,
                        const Forces& forces) {
-  const W none(0.0);
   Vec3<W> at = free;
   each_contact<W>(contacts, [&](int n, const auto& shape) {
     const Vec3<W> next = project(shape, v.x, at, v.u);
     const Vec3<W> force = v.stiffness * (next - at);
-    const W normal = dot(force, surface_at(shape, v.x, v.u).normal);
-    forces.set(n, force, select(normal > none, shape.friction * normal, none));
+    forces.set(n, force);
     at = next;
   });
+  restart_radii(contacts, v, forces);
 }
 
 // How far the contacts push a vertex once its body has moved: (f - f0) / D.

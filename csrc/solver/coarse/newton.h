@@ -2,7 +2,7 @@
 // envelopes of its contacts (solver/coarse/envelope.h).
 //
 // A pass takes the contact sums of a trial. If Phi has not risen the trial is accepted, and the twist of Newton's step leads to
-// the next one; else that twist is halved. Radii of friction move half way to friction times l in every pass that begins near
+// the next one. Else another step goes on from the trial, whose contacts the first did not see; then the first is halved. Radii of friction move half way to friction times l in every pass that begins near
 // enough. Finite motions are kept as a turn about the moving centre and a shift, so that vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
@@ -19,7 +19,7 @@ struct RigidMotion {
   PD_HD Vec3<T> of(const Vec3<T>& y) const { return turn * (y - center) + shift; }
 };
 
-constexpr int most_passes = 16, most_halvings = 8;
+constexpr int most_passes = 32, most_cuts = 8;
 // Shares of the size of a body, and of a radius: a motion that ends the passes, and one within which radii are renewed.
 constexpr double still_share = 1e-6, near_share = 1e-3;
 // Of the energy that moves a body by its size: a rise that is rounding.
@@ -72,11 +72,14 @@ class CoarseBody {
     size_ = square_root(body.square);
     length_ = size_ > 0 ? 1.0 / size_ : 1.0;
     accepted_ = trial_ = {{}, body.center, {0, 0, 0}};
-    done_ = !(body.weight > 0) || body.hold == Hold::all;
+    done_ = !moves();
   }
 
+  PD_HD bool moves() const { return body_.weight > 0 && body_.hold != Hold::all; }
   PD_HD bool is_done() const { return done_; }
   PD_HD const RigidMotion<double>& motion() const { return accepted_; }
+  // Phi there, the quadratics relative to no motion
+  PD_HD double reached() const { return energy(accepted_) + contact_energy_; }
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
@@ -95,24 +98,32 @@ class CoarseBody {
     const double rounding = energy_rounding * (body_.weight * body_.square + sum[S::before]);
     if (after <= before + rounding) {
       accepted_ = trial_;
-      halvings_ = 0;
+      contact_energy_ = sum[S::after];
+      cuts_ = 0;
       const bool settled = sum[S::lag] <= still_share * still_share * sum[S::radius];
       done_ = (passes_ > 0 && way_ <= still_share * size_ && settled) || ++passes_ > most_passes;
-      if (!done_) find_step(sum);
+      if (!done_) find_step(accepted_, sum, step_);
+    } else if (!again_) {
+      double more[6];
+      find_step(trial_, sum, more);
+      again_ = true;
+      return take(more, trial_);
     } else {
-      done_ = ++halvings_ > most_halvings;
+      done_ = ++cuts_ > most_cuts;
       for (double& number : step_) number *= 0.5;
     }
-    if (!done_) try_step();
+    again_ = false;
+    way_ = 0;
+    if (!done_) take(step_, accepted_);
   }
 
-  // Of the quadratics, relative to no motion: at `motion`.
+ private:
+  // Of the quadratics, relative to no motion.
   PD_HD double energy(const RigidMotion<double>& motion) const {
     return 0.5 * body_.weight * dot(motion.shift, motion.shift) - dot(motion.shift, body_.pull) -
            frobenius(motion.turn, body_.covariance);
   }
 
- private:
   // whether the trial is near enough to the last one
   PD_HD bool renews() const { return passes_ > 0 && way_ <= near_share * size_; }
 
@@ -123,72 +134,74 @@ class CoarseBody {
     return product;
   }
 
-  // The step of Newton's method in the accepted motion, in lengths: turns times the size.
-  PD_HD void find_step(const double (&sum)[ContactSums::count]) {
+  // The step of Newton's method at a motion, in lengths: turns times the size.
+  PD_HD void find_step(const RigidMotion<double>& at, const double (&sum)[ContactSums::count],
+                       double (&step)[6]) const {
     using S = ContactSums;
     // sum a (r + d) r^T and sum a r r^T, with the arms and ways of now
-    const Mat3<double> covariance = transpose(turned(accepted_, transpose(body_.covariance)));
-    const Vec3<double> moment = axis_of(covariance);
+    const Mat3<double> covariance = transpose(turned(at, transpose(body_.covariance)));
     Mat3<double> second = axis_matrix(covariance);
     if (!is_positive(second)) {
-      const Mat3<double> half = turned(accepted_, body_.second_moment);
-      second = axis_matrix(transpose(turned(accepted_, transpose(half))));
+      const Mat3<double> half = turned(at, body_.second_moment);
+      second = axis_matrix(transpose(turned(at, transpose(half))));
     }
-    const Vec3<double> force = subtract_product(body_.pull, body_.weight, accepted_.shift);
+    const Vec3<double> force = subtract_product(body_.pull, body_.weight, at.shift),
+                       moment = axis_of(covariance);
+    const double own[6] = {force.x, force.y, force.z, moment.x, moment.y, moment.z};
     double matrix[21];
     for (int n = 0; n < 21; ++n) matrix[n] = sum[S::matrix + n];
     const double rows[3][3] = {{second.row[0].x, second.row[0].y, second.row[0].z},
                                {second.row[1].x, second.row[1].y, second.row[1].z},
                                {second.row[2].x, second.row[2].y, second.row[2].z}};
-    const double load[6] = {force.x, force.y, force.z, moment.x, moment.y, moment.z};
     for (int i = 0; i < 6; ++i) {
       const double scale = i < 3 ? 1.0 : length_;
-      step_[i] = scale * (load[i] + sum[S::force + i]);
+      step[i] = scale * (own[i] + sum[S::force + i]);
       for (int j = 0; j <= i; ++j) {
         double& number = matrix[S::at(i, j) - S::matrix];
         number += i < 3 ? (i == j ? body_.weight : 0.0) : j < 3 ? 0.0 : rows[i - 3][j - 3];
         number *= scale * (j < 3 ? 1.0 : length_);
       }
     }
-    if (body_.hold != Hold::none) keep_to_pins(matrix);
-    solve_6x6(matrix, step_);
+    if (body_.hold != Hold::none) keep_to_pins(matrix, step);
+    solve_6x6(matrix, step);
   }
 
   // Pins leave no shift; along a line they leave the turn about it.
-  PD_HD void keep_to_pins(double (&matrix)[21]) {
+  PD_HD void keep_to_pins(double (&matrix)[21], double (&step)[6]) const {
     const auto entry = [&](int i, int j) -> double& { return matrix[i * (i + 1) / 2 + j]; };
     for (int i = 0; i < 6; ++i) {
       for (int j = 0; j < 3 && j <= i; ++j) entry(i, j) = 0;
-      if (i < 3) step_[i] = 0;
+      if (i < 3) step[i] = 0;
     }
     if (body_.hold != Hold::line) return;
     const double n[3] = {body_.axis.x, body_.axis.y, body_.axis.z};
     double along = 0, force = 0;
     for (int i = 0; i < 3; ++i) {
-      force += n[i] * step_[3 + i];
+      force += n[i] * step[3 + i];
       for (int j = 0; j < 3; ++j) along += n[i] * n[j] * (i > j ? entry(3 + i, 3 + j) : entry(3 + j, 3 + i));
     }
     for (int i = 0; i < 3; ++i) {
-      step_[3 + i] = force * n[i];
+      step[3 + i] = force * n[i];
       for (int j = 0; j <= i; ++j) entry(3 + i, 3 + j) = along * ((i == j ? 1.0 : 0.0));
     }
   }
 
-  PD_HD void try_step() {
-    const Vec3<double> shift = {step_[0], step_[1], step_[2]}, turn = {step_[3], step_[4], step_[5]};
-    way_ = square_root(dot(shift, shift)) + square_root(dot(turn, turn));
-    const Mat3<double> more = small_turn(length_ * turn);
-    trial_.shift = accepted_.shift + shift;
-    const Mat3<double> product = more * accepted_.turn;
+  // Sets the trial to a motion after a step.
+  PD_HD void take(const double (&step)[6], const RigidMotion<double>& from) {
+    const Vec3<double> shift = {step[0], step[1], step[2]}, turn = {step[3], step[4], step[5]};
+    way_ += square_root(dot(shift, shift)) + square_root(dot(turn, turn));
+    const Mat3<double> more = small_turn(length_ * turn), product = more * from.turn;
+    RigidMotion<double> to = {{}, from.center, from.shift + shift};
     for (int r = 0; r < 3; ++r)
-      trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
+      to.turn.row[r] = (from.turn.row[r] + more.row[r]) + product.row[r];
+    trial_ = to;
   }
 
   RigidBody body_;
   RigidMotion<double> accepted_, trial_;
-  double size_, length_, step_[6], way_ = 0;  // length_: 1 / size_
-  int passes_ = 0, halvings_ = 0;
-  bool done_ = true;
+  double size_, length_, step_[6], way_ = 0, contact_energy_ = 0;  // length_: 1 / size_
+  int passes_ = 0, cuts_ = 0;
+  bool again_ = false, done_ = true;
 };
 
 }  // namespace pd::inline PD_TARGET
