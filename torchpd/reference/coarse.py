@@ -286,18 +286,28 @@ def _newton_step(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
     on = second.any(axis=(1, 2))
     matrix = motions.hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
     force = np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient
-    return np.asarray(np.linalg.solve(matrix, force))
+    # a line has no inertia about itself
+    return np.asarray(np.linalg.lstsq(matrix, force, rcond=1e-12)[0])
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
-    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island."""
-    problem = motions.problem
-    before = contacts.normal_anchors[:, None] * contacts.normals + contacts.tangent_anchors
-    each = contacts.weights[:, :, None] * (contacts.forces(radius) - before)[:, None, :]
-    forces = np.zeros_like(motions.displacement)
-    np.add.at(forces, contacts.vertices.reshape(-1), each.reshape(-1, 3))
-    pushed = motions.displacement + np.where(problem.free[:, None], forces / problem.diagonal[:, None], 0.0)
-    moved, own = motions.displacement.copy(), np.concatenate(motions.bodies)
+    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island.
+
+    A vertex that touches several planes and spheres is pushed by one after another.
+    """
+    problem, own = motions.problem, np.concatenate(motions.bodies)
+    several = len(problem.values.planes) + len(problem.values.spheres)
+    rows = np.array_split(np.arange(several * len(motions.vertices)), max(several, 1))
+    pushed = motions.displacement.copy()
+    for of in [*rows, np.arange(several * len(motions.vertices), len(contacts.gaps))]:
+        each = contacts.chosen(of)
+        way = (each.weights[:, :, None] * (pushed - motions.displacement)[each.vertices]).sum(axis=1)
+        before = each.normal_anchors[:, None] * each.normals + each.tangent_anchors
+        push = each.weights[:, :, None] * (each.shifted(way).forces(radius[of]) - before)[:, None, :]
+        forces = np.zeros_like(pushed)
+        np.add.at(forces, each.vertices.reshape(-1), push.reshape(-1, 3))
+        pushed = pushed + np.where(problem.free[:, None], forces / problem.diagonal[:, None], 0.0)
+    moved = motions.displacement.copy()
     moved[own] = problem.project(pushed)[own]
     return moved
 

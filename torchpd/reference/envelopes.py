@@ -60,6 +60,10 @@ class Envelopes:
     normal_anchors: Array  # [m] l0, N
     tangent_anchors: Array  # [m, 3] t0, N
 
+    def chosen(self, of: Index) -> Envelopes:
+        """Some of the contacts."""
+        return Envelopes(*(getattr(self, item.name)[of] for item in fields(self)))
+
     def tangential(self, vectors: Array) -> Array:
         """The part of vectors [m, 3] along the surfaces."""
         return np.asarray(vectors - (vectors * self.normals).sum(axis=1, keepdims=True) * self.normals)

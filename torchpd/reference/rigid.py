@@ -30,20 +30,23 @@ def corrected(
 
 
 def first_iterate(problem: StepProblem, guess: Array) -> Array:
-    """u_0 [V, 3] m: every body in its present shape, or at a guess [V, 3] m if that has the lower Phi; both corrected.
+    """u_0 [V, 3] m: every body in its present shape, or at a guess [V, 3] m if that has the lower energy; both corrected.
 
-    Contacts answer the elastic forces of the present shape. Elastic energies differ by the work of the mean elastic
-    force from one to the other, to third order: internal forces have no torque, so rigid motions do not change it.
+    The energy is Phi less |f0|^2 / (2 D). Elastic energies differ by the work of the mean elastic force, to third order:
+    internal forces have no torque, so rigid motions do not change it. For the present shape, contacts answer the elastic
+    forces alone.
     """
     states = [problem.project(problem.hold(u)) for u in (np.zeros_like(guess), guess)]
+    gradients = [problem.gradient(u) for u in states]
     elastic = [
-        problem.gradient(u) - np.where(problem.free[:, None], problem.weight[:, None] * (u - problem.target), 0.0)
-        for u in states
+        gradient - np.where(problem.free[:, None], problem.weight[:, None] * (u - problem.target), 0.0)
+        for gradient, u in zip(gradients, states, strict=True)
     ]
-    forces = pushes_of(problem, states[0], elastic[0])
-    kept, moved = (correct(problem, u, forces) for u in states)
+    forces = [pushes_of(problem, u, g) for u, g in zip(states, (elastic[0], gradients[1]), strict=True)]
+    kept, moved = (correct(problem, u, f) for u, f in zip(states, forces, strict=True))
+    anchors = [0.5 * (f**2).sum(axis=(0, 2)) / problem.diagonal for f in forces]
+    work = 0.5 * ((elastic[0] + elastic[1]) * (states[1] - states[0])).sum(axis=1) + anchors[0] - anchors[1]
     component = problem.values.component
-    work = 0.5 * ((elastic[0] + elastic[1]) * (states[1] - states[0])).sum(axis=1)
     # clamped bodies have no Phi, and take the guess
     lower = ~(moved.energies + np.bincount(component, work) >= kept.energies) | np.isinf(kept.energies)
     return np.where(lower[component, None], moved.displacement, kept.displacement)

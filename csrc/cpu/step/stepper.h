@@ -190,23 +190,26 @@ class Stepper {
   Value present_iterate(std::int64_t i) const { return vertex(i).current_iterate(contacts_); }
   Value guessed_iterate(std::int64_t i) const { return vertex(i).first_iterate(contacts_, guess(i)); }
 
-  // The present shape and the guess are both corrected, with the forces by which the contacts answer the elastic forces of the former.
-  // The one with the lower Phi stays. Elastic energies differ by the work of the mean elastic force, which rigid motions do not change.
+  // The present shape and the guess are both corrected, and the one with the lower energy stays: Phi less |f0|^2 / (2 D). Elastic
+  // energies differ by the work of the mean elastic force, which rigid motions do not change. For the present shape, contacts answer
+  // the elastic forces alone.
   void choose_first_iterate() {
-    const auto add_work = [&](std::int64_t i, const Vec3<Wide>& force) {
+    const auto add_work = [&](std::int64_t i, const Vec3<Wide>& force, double side) {
       const Vec3<Wide> way = widened<Wide>(Lanes::vec3(guessed_iterate(i))) -
                              widened<Wide>(Lanes::vec3(present_iterate(i)));
-      w_.work[i] = w_.work[i] + Lanes::narrow(Wide(0.5) * dot(force, way));
+      Wide work = Wide(0.5) * dot(force, way);
+      if constexpr (HasContacts) {
+        keep_forces(i, force, Wide(side > 0 ? 0.0 : 1.0));
+        work = multiply_add(Wide(side), anchor_energy(contacts_, coarse_vertex(w_, i), forces_of(i)), work);
+      }
+      w_.work[i] = w_.work[i] + Lanes::narrow(work);
     };
     each_that_moves([&](std::int64_t i) {
       w_.u[i] = present_iterate(i);
       w_.work[i] = Real(T(0));
     });
     team_.barrier();
-    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) {
-      add_work(i, force);
-      if constexpr (HasContacts) keep_forces(i, force, Wide(0.0));
-    });
+    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, 1.0); });
     correct();
     if (team_.rank == 0) {
       for (int n = 0; n < plan_.components * width; ++n) w_.reached[n] = w_.bodies[n].reached();
@@ -216,10 +219,7 @@ class Stepper {
       w_.u[i] = guessed_iterate(i);
     });
     team_.barrier();
-    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) {
-      add_work(i, force);
-      if constexpr (HasContacts) restart_radii(contacts_, coarse_vertex(w_, i), forces_of(i));
-    });
+    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, -1.0); });
     correct();
     if (team_.rank == 0) sum_rises();
     team_.barrier();

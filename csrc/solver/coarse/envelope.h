@@ -57,8 +57,8 @@ struct Envelope {
   PD_HD Rub rub(const Vec3<W>& slip, const W& radius) const {
     const Vec3<W> pull = subtract_product(tangent_anchor, stiffness, slip);
     const W square = dot(pull, pull), size = square_root(square);
-    const auto cut = size > radius;
-    return {pull, square, select(cut, radius / select(cut, size, W(1.0)), W(1.0))};
+    const W cut = radius / select(size > W(0.0), size, W(1.0));
+    return {pull, square, select(size < radius, W(1.0), cut)};
   }
 
   // the force at the iterate
@@ -144,39 +144,40 @@ PD_HD void each_contact(const Contacts<R>& contacts, const Visit& visit) {
   }
 }
 
-// Begins anew with the same forces at another displacement u.
-template <class R, class W, class Forces>
-PD_HD void restart_radii(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
-  const W none(0.0);
-  each_contact<W>(contacts, [&](int n, const auto& shape) {
-    const W normal = dot(forces.force(n), surface_at(shape, v.x, v.u).normal);
-    forces.set_radius(n, select(normal > none, shape.friction * normal, none));
-  });
-}
-
 // Keeps the forces with which the contacts stop a plain iteration at `free`.
 template <class R, class W, class Forces>
 PD_HD void keep_forces(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Vec3<W>& free,
                        const Forces& forces) {
+  const W none(0.0);
   Vec3<W> at = free;
   each_contact<W>(contacts, [&](int n, const auto& shape) {
     const Vec3<W> next = project(shape, v.x, at, v.u);
     const Vec3<W> force = v.stiffness * (next - at);
-    forces.set(n, force);
+    const W normal = dot(force, surface_at(shape, v.x, v.u).normal);
+    forces.set(n, force, select(normal > none, shape.friction * normal, none));
     at = next;
   });
-  restart_radii(contacts, v, forces);
 }
 
-// How far the contacts push a vertex once its body has moved: (f - f0) / D.
+// Of these forces: sum |f0|^2 / (2 D), which Phi has more than the energy.
+template <class R, class W, class Forces>
+PD_HD W anchor_energy(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
+  const W none(0.0), one(1.0), stiffness = select(v.stiffness > none, v.stiffness, one);
+  W square(0.0);
+  for (int n = 0; n < contacts.plane_count + contacts.sphere_count; ++n)
+    square = square + dot(forces.force(n), forces.force(n));
+  return W(0.5) * square / stiffness;
+}
+
+// How far the contacts push a vertex once its body has moved, one after another: (f - f0) / D.
 template <class R, class W, class Forces>
 PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
-  const W none(0.0), one(1.0), inverse = select(v.stiffness > none, one / select(v.stiffness > none, v.stiffness, one), none);
+  const W none(0.0), one(1.0), stiffness = select(v.stiffness > none, v.stiffness, one);
+  const W inverse = select(v.stiffness > none, one / stiffness, none);
   Vec3<W> push = {none, none, none};
   each_contact<W>(contacts, [&](int n, const auto& shape) {
-    const Surface<W> at = surface_at(shape, v.x, v.u);
-    const Vec3<W> before = forces.force(n);
-    const Envelope<W> envelope(select(v.stiffness > none, v.stiffness, one), before, at.normal);
+    const Surface<W> at = surface_at(shape, v.x, v.u + push);
+    const Envelope<W> envelope(stiffness, forces.force(n), at.normal);
     push = push + inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
   });
   return push;
