@@ -256,21 +256,21 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
     phi = motions.energy + contacts.energy(radius)
     for _ in range(PASSES):
         step = _newton_step(motions, contacts, radius)
-        for attempt in range(2 * CUTS + 2):
-            again = attempt % 2 == 1  # on from the trial, whose contacts the first step did not see
-            more = _newton_step(trial, after, radius) if again else step
-            trial = (trial if again else motions).after(more)
+        for _ in range(CUTS + 1):
+            trial = motions.after(step)
             after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
             way = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
             energy = contacts.energy(radius)
             reached = replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
-            share = motions.share(more) + (share if again else 0.0)
+            share = motions.share(step)
             if share <= NEAR:
                 radius = radius + 0.5 * (after.friction * after.normal_forces() - radius)
             rise = reached - energy + trial.energy - motions.energy
             if rise <= ROUNDING * (motions.scale + energy):
                 break
-            step = 0.5 * step if again else step
+            force, matrix = _newton_terms(trial, after, radius)
+            back = -float(force @ step) / float(step @ matrix @ step)
+            step = (1.0 - back if 0.0 < back < 1.0 else 0.5) * step
         else:
             break
         motions, contacts, phi = trial, after, trial.energy + reached
@@ -280,12 +280,16 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
     return _pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
-def _newton_step(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
-    """The step [N] of Newton's method on Phi for fixed friction radii [m] N."""
+def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """Minus the first derivative [N] of Phi for fixed friction radii [m] N, and the second [N, N] of its model."""
     jacobian, second = motions.jacobian(contacts), contacts.second_derivatives(radius)
     on = second.any(axis=(1, 2))
     matrix = motions.hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-    force = np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient
+    return np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient, matrix
+
+
+def _newton_step(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
+    force, matrix = _newton_terms(motions, contacts, radius)
     # a line has no inertia about itself
     return np.asarray(np.linalg.lstsq(matrix, force, rcond=1e-12)[0])
 

@@ -2,7 +2,7 @@
 // envelopes of its contacts (solver/coarse/envelope.h).
 //
 // A pass takes the contact sums of a trial. If Phi has not risen the trial is accepted, and the twist of Newton's step leads to
-// the next one. Else another step goes on from the trial, whose contacts the first did not see; then the first is halved. Radii of friction move half way to friction times l in every pass that begins near
+// the next one. Else the step ends where the quadratic model of Phi at the trial is least along it. Radii of friction move half way to friction times l in every pass that begins near
 // enough. Finite motions are kept as a turn about the moving centre and a shift, so that vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
@@ -102,19 +102,12 @@ class CoarseBody {
       cuts_ = 0;
       const bool settled = sum[S::lag] <= still_share * still_share * sum[S::radius];
       done_ = (passes_ > 0 && way_ <= still_share * size_ && settled) || ++passes_ > most_passes;
-      if (!done_) find_step(accepted_, sum, step_);
-    } else if (!again_) {
-      double more[6];
-      find_step(trial_, sum, more);
-      again_ = true;
-      return take(more, trial_);
+      if (!done_) find_step(sum);
     } else {
       done_ = ++cuts_ > most_cuts;
-      for (double& number : step_) number *= 0.5;
+      shorten(sum);
     }
-    again_ = false;
-    way_ = 0;
-    if (!done_) take(step_, accepted_);
+    if (!done_) take_step();
   }
 
  private:
@@ -134,9 +127,9 @@ class CoarseBody {
     return product;
   }
 
-  // The step of Newton's method at a motion, in lengths: turns times the size.
-  PD_HD void find_step(const RigidMotion<double>& at, const double (&sum)[ContactSums::count],
-                       double (&step)[6]) const {
+  // Minus the first derivative of Phi at a motion, and the second, by its lower triangle. In lengths: turns times the size.
+  PD_HD void find_terms(const RigidMotion<double>& at, const double (&sum)[ContactSums::count],
+                        double (&step)[6], double (&matrix)[21]) const {
     using S = ContactSums;
     // sum a (r + d) r^T and sum a r r^T, with the arms and ways of now
     const Mat3<double> covariance = transpose(turned(at, transpose(body_.covariance)));
@@ -148,7 +141,6 @@ class CoarseBody {
     const Vec3<double> force = subtract_product(body_.pull, body_.weight, at.shift),
                        moment = axis_of(covariance);
     const double own[6] = {force.x, force.y, force.z, moment.x, moment.y, moment.z};
-    double matrix[21];
     for (int n = 0; n < 21; ++n) matrix[n] = sum[S::matrix + n];
     const double rows[3][3] = {{second.row[0].x, second.row[0].y, second.row[0].z},
                                {second.row[1].x, second.row[1].y, second.row[1].z},
@@ -163,7 +155,25 @@ class CoarseBody {
       }
     }
     if (body_.hold != Hold::none) keep_to_pins(matrix, step);
-    solve_6x6(matrix, step);
+  }
+
+  PD_HD void find_step(const double (&sum)[ContactSums::count]) {
+    double matrix[21];
+    find_terms(accepted_, sum, step_, matrix);
+    solve_6x6(matrix, step_);
+  }
+
+  // Ends the step where the quadratic model of Phi at the trial is least along it, or half way.
+  PD_HD void shorten(const double (&sum)[ContactSums::count]) {
+    double force[6], matrix[21], slope = 0, second = 0;
+    find_terms(trial_, sum, force, matrix);
+    for (int i = 0; i < 6; ++i) {
+      slope -= force[i] * step_[i];
+      for (int j = 0; j <= i; ++j)
+        second += (i == j ? 1.0 : 2.0) * step_[i] * step_[j] * matrix[i * (i + 1) / 2 + j];
+    }
+    const double back = slope / second, share = back > 0 && back < 1 ? 1.0 - back : 0.5;
+    for (double& number : step_) number *= share;
   }
 
   // Pins leave no shift; along a line they leave the turn about it.
@@ -186,22 +196,20 @@ class CoarseBody {
     }
   }
 
-  // Sets the trial to a motion after a step.
-  PD_HD void take(const double (&step)[6], const RigidMotion<double>& from) {
-    const Vec3<double> shift = {step[0], step[1], step[2]}, turn = {step[3], step[4], step[5]};
-    way_ += square_root(dot(shift, shift)) + square_root(dot(turn, turn));
-    const Mat3<double> more = small_turn(length_ * turn), product = more * from.turn;
-    RigidMotion<double> to = {{}, from.center, from.shift + shift};
+  PD_HD void take_step() {
+    const Vec3<double> shift = {step_[0], step_[1], step_[2]}, turn = {step_[3], step_[4], step_[5]};
+    way_ = square_root(dot(shift, shift)) + square_root(dot(turn, turn));
+    const Mat3<double> more = small_turn(length_ * turn), product = more * accepted_.turn;
+    trial_.shift = accepted_.shift + shift;
     for (int r = 0; r < 3; ++r)
-      to.turn.row[r] = (from.turn.row[r] + more.row[r]) + product.row[r];
-    trial_ = to;
+      trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
   }
 
   RigidBody body_;
   RigidMotion<double> accepted_, trial_;
   double size_, length_, step_[6], way_ = 0, contact_energy_ = 0;  // length_: 1 / size_
   int passes_ = 0, cuts_ = 0;
-  bool again_ = false, done_ = true;
+  bool done_ = true;
 };
 
 }  // namespace pd::inline PD_TARGET
