@@ -34,7 +34,8 @@ __all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "isl
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-PASSES = 32  # accepted steps of Newton's method
+OUTER = 6  # finite motions
+PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
 STILL = 1e-6  # of the size of a body, and of the friction radii: a step that ends the passes
@@ -254,44 +255,59 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
     phi = motions.energy + contacts.energy(radius)
-    for _ in range(PASSES):
-        step = _newton_step(motions, contacts, radius)
+    for _ in range(OUTER):
+        motion, radius = _model_minimum(motions, contacts, radius)
+        energy = motions.energy + contacts.energy(radius)
         for _ in range(CUTS + 1):
-            trial = motions.after(step)
+            trial = motions.after(motion)
             after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
             way = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
-            energy = contacts.energy(radius)
-            reached = replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
-            share = motions.share(step)
-            if share <= NEAR:
-                radius = radius + 0.5 * (after.friction * after.normal_forces() - radius)
-            rise = reached - energy + trial.energy - motions.energy
-            if rise <= ROUNDING * (motions.scale + energy):
+            reached = trial.energy + replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
+            if reached <= energy + ROUNDING * (motions.scale + energy):
                 break
-            force, matrix = _newton_terms(trial, after, radius)
-            back = -float(force @ step) / float(step @ matrix @ step)
-            step = (1.0 - back if 0.0 < back < 1.0 else 0.5) * step
+            motion = 0.5 * motion
         else:
             break
-        motions, contacts, phi = trial, after, trial.energy + reached
-        lag = after.friction * after.normal_forces() - radius
-        if share <= STILL and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
+        share = motions.share(motion)
+        motions, contacts, phi = trial, after, reached
+        if share <= STILL:
             break
     return _pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
-def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
-    """Minus the first derivative [N] of Phi for fixed friction radii [m] N, and the second [N, N] of its model."""
-    jacobian, second = motions.jacobian(contacts), contacts.second_derivatives(radius)
-    on = second.any(axis=(1, 2))
-    matrix = motions.hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-    return np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient, matrix
+def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
+    Newton's steps, each ended where the model is least along it. Radii move half way to friction l where a step is near
+    enough to the minimum.
+    """
+    gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
+    motion = np.zeros(len(gradient))
 
-def _newton_step(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
-    force, matrix = _newton_terms(motions, contacts, radius)
-    # a line has no inertia about itself
-    return np.asarray(np.linalg.lstsq(matrix, force, rcond=1e-12)[0])
+    def slope(motion: Array, step: Array) -> float:
+        forces = contacts.shifted(jacobian @ motion).forces(radius)
+        return float((gradient + hessian @ motion) @ step - ((jacobian @ step) * forces).sum())
+
+    for _ in range(PASSES):
+        trial = contacts.shifted(jacobian @ motion)
+        second = trial.second_derivatives(radius)
+        on = second.any(axis=(1, 2))
+        matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
+        force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion
+        # a line has no inertia about itself
+        step = np.linalg.lstsq(matrix, force, rcond=1e-12)[0]
+        low, high = 0.0, 1.0
+        if slope(motion + step, step) > 1e-9 * abs(slope(motion, step)):
+            for _ in range(40):
+                middle = 0.5 * (low + high)
+                low, high = (middle, high) if slope(motion + middle * step, step) < 0.0 else (low, middle)
+        motion, share = motion + high * step, motions.share(high * step)
+        lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
+        if share <= STILL and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
+            break
+        if share <= NEAR:
+            radius = radius + 0.5 * lag
+    return motion, radius
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
