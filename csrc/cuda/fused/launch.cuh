@@ -243,6 +243,7 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const Launch& l
   arena.place(s.weights, own ? 0 : teams * plan.blocks * pair_weights * pair_lanes);
   arena.place(s.pieces, teams * launch.patches * plan.pieces);
   arena.place(s.part_sum, teams * plan.parts * PartSums::count);
+  s.forces = arrange_contact_forces(arena, step, teams);
   return s;
 }
 

@@ -42,7 +42,7 @@ PD_HD bool is_positive(const Mat3<double>& a) {
 }
 
 // x with A x = b for a symmetric A that is not negative, by its lower triangle, row by row; 0 along rows without pivot.
-PD_HD void solve_6x6(double (&a)[21], double (&b)[6]) {
+PD_CALLED inline void solve_6x6(double (&a)[21], double (&b)[6]) {
   const auto at = [](int i, int j) { return i * (i + 1) / 2 + j; };
   double most = 0, inverse[6];
   for (int i = 0; i < 6; ++i) most = a[at(i, i)] > most ? a[at(i, i)] : most;
