@@ -19,7 +19,7 @@ struct RigidMotion {
   PD_HD Vec3<T> of(const Vec3<T>& y) const { return turn * (y - center) + shift; }
 };
 
-constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 6;
+constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 24;
 // Shares of the size of a body, and of a radius: a step that ends the passes, and one within which radii are renewed.
 constexpr double still_share = 1e-6, near_share = 1e-3;
 // Of the energy that moves a body by its size: a rise that is rounding.
