@@ -11,7 +11,7 @@ from .coarse import MotionsOf, RigidMotions, correct
 from .envelopes import pushes_of
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["corrected", "first_iterate"]
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 def corrected(
-    problem: StepProblem,
+    problem: Objective,
     displacement: Array,
     gradient: Array | None = None,
     motions: MotionsOf = RigidMotions,
@@ -29,7 +29,7 @@ def corrected(
     return correct(problem, displacement, pushes_of(problem, displacement, gradient), motions=motions).displacement
 
 
-def first_iterate(problem: StepProblem, guess: Array) -> Array:
+def first_iterate(problem: Objective, guess: Array) -> Array:
     """u_0 [V, 3] m: every body in its present shape, or at a guess [V, 3] m if that has the lower energy; both corrected.
 
     The energy is Phi less |f0|^2 / (2 D). Elastic energies differ by the work of the mean elastic force, to third order:
