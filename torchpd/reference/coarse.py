@@ -208,6 +208,7 @@ class Correction(NamedTuple):
     displacement: Array  # [V, 3] m
     forces: Array  # [m, 3] N of the pairs
     energies: Array  # [components] J: Phi of its island, before the pushes; inf where pins leave no motion
+    pushes: Array  # [V, 3] m: after the motion, by the contacts and the projection
 
 
 def correct(
@@ -228,15 +229,16 @@ def correct(
         motions: makes the motions of an island.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
-    energies = np.full(int(problem.values.component.max()) + 1, np.inf)
+    energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
     for bodies, of in islands(problem, pairs):
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, each, energy = _correct_island(moving, forces, own)
+        corrected, push, each, energy = _correct_island(moving, forces, own)
+        pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
         energies[problem.values.component[[body[0] for body in bodies]]] = energy
-    return Correction(corrected, after, energies)
+    return Correction(corrected, after, energies, pushes)
 
 
 def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
@@ -252,8 +254,8 @@ def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[t
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, float]:
-    """Displacement [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
+def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, Array, float]:
+    """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
@@ -274,7 +276,7 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
         motions, contacts, phi = trial, after, reached
         if share <= STILL:
             break
-    return _pushed(motions, contacts, radius), contacts.forces(radius), phi
+    return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
 def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
@@ -321,8 +323,8 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
     return motion, radius
 
 
-def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
-    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island.
+def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island, and these changes.
 
     A vertex that touches several planes and spheres is pushed by one after another.
     """
@@ -340,7 +342,7 @@ def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
         pushed = pushed + np.where(problem.free[:, None], forces / problem.diagonal[:, None], 0.0)
     moved = motions.displacement.copy()
     moved[own] = problem.project(pushed)[own]
-    return moved
+    return moved, moved - motions.displacement
 
 
 def _cross(vectors: Array) -> Array:

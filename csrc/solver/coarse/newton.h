@@ -19,7 +19,7 @@ struct RigidMotion {
   PD_HD Vec3<T> of(const Vec3<T>& y) const { return turn * (y - center) + shift; }
 };
 
-constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 24;
+constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 30;
 // Shares of the size of a body, and of a radius: a step that ends the passes, and one within which radii are renewed.
 constexpr double still_share = 1e-6, near_share = 1e-3;
 // Of the energy that moves a body by its size: a rise that is rounding.
@@ -39,7 +39,8 @@ PD_HD Mat3<double> small_turn(const Vec3<double>& v) {
 }
 
 PD_HD bool is_positive(const Mat3<double>& a) {
-  return a.row[0].x > 0 && difference_of_products(a.row[0].x, a.row[1].y, a.row[0].y, a.row[1].x) > 0 &&
+  return a.row[0].x > 0 &&
+         difference_of_products(a.row[0].x, a.row[1].y, a.row[0].y, a.row[1].x) > 0 &&
          determinant(a) > 0;
 }
 
@@ -85,7 +86,12 @@ class CoarseBody {
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
-    return {accepted_.turn, trial_.turn, body_.center, accepted_.shift, trial_.shift, finite_ ? 1.0 : 0.0,
+    return {accepted_.turn,
+            trial_.turn,
+            body_.center,
+            accepted_.shift,
+            trial_.shift,
+            finite_ ? 1.0 : 0.0,
             !finite_ && way_ > 0 && way_ <= near_share * size_ ? 0.5 : 0.0};
   }
 
@@ -113,7 +119,8 @@ class CoarseBody {
   // After the pass of a finite motion: accepts it, or halves its twist.
   PD_HD void end_motion(const double (&sum)[ContactSums::count]) {
     using S = ContactSums;
-    const double before = energy(accepted_) + sum[S::before], after = energy(trial_) + sum[S::after];
+    const double before = energy(accepted_) + sum[S::before],
+                 after = energy(trial_) + sum[S::after];
     if (!(after <= before + energy_rounding * (body_.weight * body_.square + sum[S::before]))) {
       done_ = ++cuts_ > most_cuts;
       for (double& number : twist_) number *= 0.5;
@@ -132,21 +139,24 @@ class CoarseBody {
     begin_step(sum);
   }
 
-  // After a pass to first order: ends the step, or shortens it to where its slope is none.
+  // After a pass to first order: ends the step, or goes on to where Phi is least along it.
   PD_HD void go_on(const double (&sum)[ContactSums::count]) {
     using S = ContactSums;
     double at[6], force[6], matrix[21], slope = 0, second = 0;
-    for (int i = 0; i < 6; ++i) at[i] = twist_[i] + step_[i];
+    for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
     find_terms(at, sum, force, matrix);
     for (int i = 0; i < 6; ++i) {
       slope -= force[i] * step_[i];
       for (int j = 0; j <= i; ++j)
         second += (i == j ? 1.0 : 2.0) * step_[i] * step_[j] * matrix[i * (i + 1) / 2 + j];
     }
-    const double share = 1.0 - slope / second;
-    if (slope > no_slope * slope_ && share > 0 && share < 1 && ++searches_ <= most_searches) {
-      for (double& number : step_) number *= share;
-      slope_ *= share;
+    const bool ends =
+        share_ == 1.0 ? slope <= no_slope * slope_ : absolute(slope) <= no_slope * slope_;
+    if (!ends && ++searches_ <= most_searches) {
+      (slope < 0 ? low_ : high_) = share_;
+      // the slope rises: Newton's step within the bracket, or its middle
+      const double next = share_ - slope / second;
+      share_ = low_ < next && next < high_ ? next : 0.5 * (low_ + high_);
       return try_step();
     }
     for (int i = 0; i < 6; ++i) twist_[i] = at[i];
@@ -163,6 +173,7 @@ class CoarseBody {
     slope_ = 0;
     for (int i = 0; i < 6; ++i) slope_ += force[i] * step_[i];
     searches_ = 0;
+    low_ = 0, high_ = share_ = 1;
     try_step();
   }
 
@@ -173,9 +184,10 @@ class CoarseBody {
 
   // The trial to first order: the twist and the step.
   PD_HD void try_step() {
-    way_ = length_of(step_);
-    const Vec3<double> shift = {twist_[0] + step_[0], twist_[1] + step_[1], twist_[2] + step_[2]},
-                       turn = {twist_[3] + step_[3], twist_[4] + step_[4], twist_[5] + step_[5]};
+    way_ = share_ * length_of(step_);
+    double at[6];
+    for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
+    const Vec3<double> shift = {at[0], at[1], at[2]}, turn = {at[3], at[4], at[5]};
     const Mat3<double> more = cross_matrix(length_ * turn), product = more * accepted_.turn;
     trial_.shift = accepted_.shift + shift;
     for (int r = 0; r < 3; ++r)
@@ -185,7 +197,8 @@ class CoarseBody {
   // The finite trial.
   PD_HD void try_motion() {
     finite_ = true;
-    const Vec3<double> shift = {twist_[0], twist_[1], twist_[2]}, turn = {twist_[3], twist_[4], twist_[5]};
+    const Vec3<double> shift = {twist_[0], twist_[1], twist_[2]},
+                       turn = {twist_[3], twist_[4], twist_[5]};
     const Mat3<double> more = small_turn(length_ * turn), product = more * accepted_.turn;
     trial_.shift = accepted_.shift + shift;
     for (int r = 0; r < 3; ++r)
@@ -218,7 +231,8 @@ class CoarseBody {
                         double (&force)[6], double (&matrix)[21]) const {
     using S = ContactSums;
     const Vec3<double> shift = {at[0], at[1], at[2]}, turn = {at[3], at[4], at[5]};
-    const Vec3<double> f = subtract_product(force_, body_.weight, shift), m = moment_ - second_ * turn;
+    const Vec3<double> f = subtract_product(force_, body_.weight, shift),
+                       m = moment_ - second_ * turn;
     const double own[6] = {f.x, f.y, f.z, m.x, m.y, m.z};
     const double rows[3][3] = {{second_.row[0].x, second_.row[0].y, second_.row[0].z},
                                {second_.row[1].x, second_.row[1].y, second_.row[1].z},
@@ -229,7 +243,9 @@ class CoarseBody {
       for (int j = 0; j <= i; ++j)
         matrix[i * (i + 1) / 2 + j] =
             multiply_add(scale * (j < 3 ? 1.0 : length_), sum[S::at(i, j)],
-                         i < 3 ? (i == j ? body_.weight : 0.0) : j < 3 ? 0.0 : rows[i - 3][j - 3]);
+                         i < 3   ? (i == j ? body_.weight : 0.0)
+                         : j < 3 ? 0.0
+                                 : rows[i - 3][j - 3]);
     }
     if (body_.hold != Hold::none) keep_to_pins(matrix, force);
   }
@@ -246,7 +262,8 @@ class CoarseBody {
     double along = 0, force = 0;
     for (int i = 0; i < 3; ++i) {
       force += n[i] * step[3 + i];
-      for (int j = 0; j < 3; ++j) along += n[i] * n[j] * (i > j ? entry(3 + i, 3 + j) : entry(3 + j, 3 + i));
+      for (int j = 0; j < 3; ++j)
+        along += n[i] * n[j] * (i > j ? entry(3 + i, 3 + j) : entry(3 + j, 3 + i));
     }
     for (int i = 0; i < 3; ++i) {
       step[3 + i] = force * n[i];
@@ -258,7 +275,9 @@ class CoarseBody {
   RigidMotion<double> accepted_, trial_;
   Mat3<double> second_;
   Vec3<double> force_, moment_;
-  double size_, length_, twist_[6] = {}, step_[6], way_ = 0, slope_ = 0, contact_energy_ = 0;  // length_: 1 / size_
+  double size_, length_;  // length_: 1 / size_
+  double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
+  double way_ = 0, slope_ = 0, contact_energy_ = 0;
   int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
   bool finite_ = true, done_ = true;
 };
