@@ -5,7 +5,7 @@ Every scene of `effect_scenes.py` takes one step of its motion in float32, from 
 The estimate is that of `print(sim)`. Times are processor time on a CPU, and calls with the device awaited on a GPU.
 
     python benchmarks/accuracy_by_kind.py --out benchmarks/results/accuracy-by-kind-cpu.json
-    python benchmarks/accuracy_by_kind.py --device cuda --out benchmarks/results/accuracy-by-kind-cuda.json
+    python benchmarks/accuracy_by_kind.py --device cuda --threads 16 --seconds 0.02 --out FILE
     python benchmarks/accuracy_by_kind.py --draw benchmarks/results/accuracy-by-kind-cpu.json
 """
 

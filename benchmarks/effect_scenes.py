@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from cloth import sheet
+from iteration_by_kind import sheet
 
 import torchpd as pd
 from torchpd.scene.solvers import Solver

@@ -1,4 +1,5 @@
-// Every check of an op's arguments, and nothing else. binding/plan_views.h checks the arrays of plans and materials.
+// Every check of an op's arguments, and nothing else. binding/plan_views.h and
+// binding/material_views.h check the arrays of plans and materials.
 #pragma once
 #include "views/views.h"
 

@@ -1,6 +1,7 @@
 // The solve of a step's adjoint on either device. A Backend runs a call by `conjugate`.
 #pragma once
 #include "binding/checks.h"
+#include "binding/material_views.h"
 #include "binding/plan_views.h"
 #include "binding/settings.h"
 

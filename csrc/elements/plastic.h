@@ -5,10 +5,10 @@
 // Fp has determinant 1, and is constant within a step. Where a step ends, with F_e = U diag(s) V^T,
 //
 //   e = log s,   d = e - mean(e),   gamma = (|d| - (y + H alpha))+ / (1 + H) (1 - exp(-h / tau)),   D = V exp(gamma d / |d|) V^T
-//   Fp <- D Fp,   alpha <- alpha + gamma,   then the log of Fp's stretches is scaled down to |.| <= m
+//   Fp <- D Fp / det(D Fp)^(1/3),   alpha <- alpha + gamma,   then the log of Fp's stretches is scaled down to |.| <= m
 //
 // for the yield strain e_y of a uniaxial test, y = sqrt(2/3) (1 + nu) e_y, hardening H, creep time tau, and largest flow
-// m. Nothing flows where det F_e <= 0.
+// m. Nothing flows where det F_e <= 0. D has determinant 1; the division keeps roundings from adding up over the steps.
 #pragma once
 #include "elements/corotated.h"
 #include "elements/stencil.h"
@@ -124,6 +124,7 @@ struct Plastic {
     const R slow = one - exponential(-step / select(none < row[4], row[4], one));
     const R gamma = select(none < row[4], slow, one) * ((size - yield) / (one + row[3]));
     fp = exponential_along(stretch, gamma / size, d) * fp;
+    fp = exponential(-third * logarithm(determinant(fp))) * fp;
     alpha = alpha + gamma;
   }
 

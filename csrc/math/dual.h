@@ -50,6 +50,7 @@ struct Dual {
     const R value = exponential(a.value);
     return {value, value * a.slope};
   }
+  PD_HD friend Dual logarithm(const Dual& a) { return {logarithm(a.value), a.slope / a.value}; }
   PD_HD friend Dual lesser(const Dual& a, const Dual& b) { return select(b < a, b, a); }
 
   template <class Mask>

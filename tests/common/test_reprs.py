@@ -16,6 +16,8 @@ PIN = pd.Pin(SOLID, range(4))
 GROUND = pd.Ground(friction=0.5)
 SIM = pd.Simulator(pd.Scene(SOLID, PIN, GROUND, pd.Gravity()), iterations=3)
 STATE = SIM.rest_state(2)
+FLOWING = pd.Simulator(pd.Scene(pd.Solid(MESH, youngs=1e5, plastic=pd.Plastic(0.1))), iterations=3)
+TRACK = FLOWING.rollout(FLOWING.rest_state(2), 3)
 
 
 @pytest.mark.parametrize(
@@ -23,6 +25,11 @@ STATE = SIM.rest_state(2)
     [
         (STATE, "State(batch=2, vertices=24, float32, cpu)"),
         (SIM.rollout(STATE, 3), "Track(records=3, batch=2, vertices=24, float32, cpu)"),
+        (TRACK, "HistoryTrack(records=3, batch=2, vertices=24, float32, cpu)"),
+        (TRACK.state(), "HistoryState(batch=2, vertices=24, float32, cpu)"),
+        (TRACK.state().history, "History(batch=2, plastic=30, float32, cpu)"),
+        (TRACK.history, "History(records=3, batch=2, plastic=30, float32, cpu)"),
+        (FLOWING.history_at_rest(), "History(plastic=30, float32, cpu)"),
         (SOLID, "Solid(mesh=TetMesh(24 vertices, 30 tets), youngs=100000, density=1000)"),
         (PIN, f"Pin(body={SOLID!r}, vertices=[0, 1, 2, 3], stiffness=None)"),
         (GROUND, "Ground(height=0.0, normal=[0.0, 1.0, 0.0], friction=0.5)"),

@@ -130,10 +130,14 @@ def test_iterates_are_those_of_the_cpu(name: str, outer: str) -> None:
 @pytest.mark.parametrize("outer", SOLVERS)
 @pytest.mark.parametrize("name", ["beam", "octopus", "ground", "rubber"])
 def test_float32_comes_as_near_as_on_the_cpu(name: str, outer: str) -> None:
-    """Its floor is that of the scene: 4e-4 on the octopus, whose stiffness is random over two decades."""
+    """Its floor is that of the scene: 4e-4 on the octopus, whose stiffness is random over two decades.
+
+    In 600 iterations of momentum rubber comes to 4e-4 in float64, with a restart that float32 does not need: both are
+    on their way. In 1200 it comes to 1e-6, below the floor.
+    """
     case = CASES[name]()
-    iterations = 600 if outer == "momentum" else 120
-    exact = simulator(case, torch.float64, solver=SOLVERS[outer], iterations=iterations)
+    iterations = 1200 if outer == "momentum" else 120
+    exact = simulator(case, torch.float64, solver=pd.Multilevel("corotated"), iterations=120)  # to 1e-10 everywhere
     end = exact(state_of(case, exact), **arguments_of(case, exact)).velocities
     errors = [
         relative(sim(state_of(case, sim), **arguments_of(case, sim)).velocities, end)

@@ -175,6 +175,33 @@ def test_a_ratio_of_zero_is_a_solid_without(averaging: int, kernel: str, precisi
     )
 
 
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("averaging", AVERAGING)
+def test_a_negative_modulus_is_reported(averaging: int, kernel: str, precision: str) -> None:
+    """Environments with one each, of either tetrahedron of a pair, also beside a neighbour; the last one has none."""
+    case = held(averaging)
+    gpu, cpu, _ = sims_of(case, kernel, precision, iterations=12, tolerance=0.9)
+    moduli = cpu.stiffness.detach()
+    bad = torch.arange(0, len(moduli), 3)
+    rows = moduli.repeat(len(bad) + 1, 1)
+    rows[torch.arange(len(bad)), bad] *= -1.0
+    state, forces = different(case, cpu, len(rows))
+    found = []
+    for sim in (gpu, cpu):
+        sim.set_material(stiffness=rows.abs().to(sim.device))
+        with torch.no_grad():
+            sim.stiffness.copy_(rows)
+        _, info = sim(moved(state, sim.device), forces.to(sim.device), return_info=True)
+        material, plan = [t.detach() for t in sim.material()], list(sim.plan.arrays)
+        diagonals = [torch.ops.torchpd.elastic_diagonal(material, plan, weighted=kind) for kind in (False, True)]
+        said = (info.converged, ~info.residual.isnan(), info.rho < info.rho.max())
+        found.append([*(good.cpu() for good in said), *(t.cpu() == -torch.inf for t in diagonals)])
+    for good in found[0][:3]:
+        assert good.tolist() == [False] * len(bad) + [True]
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)
+
+
 @pytest.mark.parametrize("tolerance", [0.0, 0.3])
 @pytest.mark.parametrize("own", [False, True], ids=["shared", "own rows"])
 @pytest.mark.parametrize("kernel", KERNELS)

@@ -283,6 +283,50 @@ def test_history_states_are_states() -> None:
     assert sim.rollout(state, 1, 2).history.flow.shape == (0, *state.history.flow.shape)
 
 
+def test_plain_tuples_are_states_everywhere(tmp_path: Path) -> None:
+    sim, _ = bar(iterations=20)
+    state, rest = stretched(sim, [1.2], 2), sim.rest_state(1)
+    plain = (*state[:2], tuple(state.history))
+    for given in (plain, [*state[:2], list(state.history)], pd.HistoryState(*plain)):
+        after = sim(given)
+        assert torch.equal(after.history.flow, sim(state).history.flow)
+        assert all(map(torch.equal, sim.plastic_strain(given).values(), sim.plastic_strain(state).values()))
+        assert torch.equal(sim.stress(given).cauchy, sim.stress(state).cauchy)
+        assert torch.equal(sim.energy(given), sim.energy(state))
+        sim.write_vtu(tmp_path / "plain.vtu", given, environment=1)
+        sim.write_vtu(tmp_path / "own.vtu", state, environment=1)
+        assert (tmp_path / "plain.vtu").read_bytes() == (tmp_path / "own.vtu").read_bytes()
+        kept = state.where(torch.tensor([False, True]), given)
+        assert torch.equal(kept.history.flow, state.history.flow)
+    named = pd.HistoryState(*plain)
+    assert torch.equal(named.where(torch.tensor([False, True]), rest).history.flow[0], rest.history.flow[0])
+
+
+def test_determinant_of_fp_does_not_drift() -> None:
+    """3000 flows of float32: each step's error is its own, a few roundings, and adds to no other."""
+    count = 16
+    sim = pd.Simulator(pd.Scene(pd.Solid(tets(count), 1.0, poisson=0.3, plastic=pd.Plastic(0.01))), H)
+    rng = np.random.default_rng(5)
+    plan = list(sim.plan.arrays)
+    for _ in range(3000):
+        stretches = np.exp(rng.uniform(-0.3, 0.3, (count, 3)))
+        F = random_rotations(rng, count) @ (stretches[:, :, None] * random_rotations(rng, count))
+        material = sim.material()
+        (flow,) = ops.next_history(placed(F, torch.float32), material, plan, time_step=H)
+        with torch.no_grad():
+            sim.flow.copy_(flow[0])
+    assert float(sim.flow[:, 9].min()) > 100.0  # they flow
+    plastic = sim.flow[:, :9].double().detach().reshape(count, 3, 3)
+    np.testing.assert_allclose(torch.linalg.det(plastic).numpy(), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("endless", [np.inf, [np.inf] * 240], ids=["number", "per tetrahedron"])
+def test_flow_may_have_no_bound(endless: Any) -> None:
+    sim, usual = bar(iterations=20, max_flow=endless)[0], bar(iterations=20)[0]
+    assert bool(sim.max_flow.isinf().all())
+    assert torch.equal(stretched(sim, [1.4]).history.flow, stretched(usual, [1.4]).history.flow)
+
+
 def test_states_without_history_are_refused() -> None:
     sim, _ = bar(iterations=20)
     state = sim.rest_state(2)
@@ -381,6 +425,8 @@ def test_what_does_not_go_together_is_refused(options: dict[str, Any], words: st
         ((0.1, -1.0), "Plastic.hardening must be >= 0, got -1.0"),
         ((0.1, 0.0, np.nan), "Plastic.creep_time must be finite"),
         ((0.1, 0.0, 0.0, -1.0), "Plastic.max_flow must be positive, got -1.0"),
+        ((0.1, 0.0, 0.0, -np.inf), "Plastic.max_flow must be positive, got -inf"),
+        ((0.1, 0.0, 0.0, [np.inf, np.nan]), "Plastic.max_flow must be finite"),
         (([[0.1]],), r"Plastic.yield_strain must be a scalar or one value per tetrahedron \[E\], got \[1, 1\]"),
     ],
 )
@@ -399,6 +445,17 @@ def test_material_is_set_by_name() -> None:
     with pytest.raises(TypeError, match=r"no array 'yield_strain'.* no solid is plastic"):
         elastic.set_material(yield_strain=0.1)
     assert "plastic flow: 240 tetrahedra" in repr(sim)
+
+
+def test_the_modulus_of_elastic_solids_is_refused_without_any() -> None:
+    sim, _ = bar(iterations=20)
+    for given, came in ((2e5, r"200000\.0"), (torch.ones(2, 1), r"\[2, 1\]")):
+        with pytest.raises(ValueError, match=f"stiffness has no rows in this scene.* got {came}; .*plastic_youngs"):
+            sim.set_material(stiffness=given)
+    sim.set_material(stiffness=sim.stiffness, plastic_youngs=2e5)
+    assert float(sim.plastic_youngs.min()) == 2e5
+    with pytest.raises(ValueError, match=r"pin_hard has no rows in this scene.* got True"):
+        pd.Simulator(pd.Scene(pd.Solid(BAR, 1e5))).set_material(pin_hard=True)
 
 
 def test_ops_of_history_are_citizens_of_torch() -> None:

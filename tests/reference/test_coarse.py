@@ -193,6 +193,20 @@ def test_a_ball_carries_a_cube(scenes: ModuleType, youngs: float, share: float) 
     assert scenes.error(course, run, course.converged()) <= share
 
 
+@pytest.mark.parametrize("angle", [2e-4, 0.025])
+def test_two_planes_that_are_nearly_one_rub_as_one(angle: float) -> None:
+    """Each bears half of a block of 100 MPa that cannot lie in both, so contacts open and close among the passes."""
+    mesh = pd.shapes.box((0.1,) * 3, (3,) * 3)
+    x = mesh.vertices - [0.05, 0.0, 0.05]
+    planes = [
+        pd.Ground(0.0, normal=(side * np.sin(angle / 2), np.cos(angle / 2), 0.0), friction=0.3) for side in (-1.0, 1.0)
+    ]
+    scene = pd.Scene(pd.Solid(pd.TetMesh(x, mesh.tets), 1e8), pd.Gravity(), *planes)
+    problem = step_problem(scene.values(), x, np.tile([0.0, 0.0, 1.0], (len(x), 1)), H)
+    along = float(coarse_chebyshev(problem, iterations=3)[:, 2].mean()) / H
+    assert along == pytest.approx(1.0 - 0.3 * 9.81 * H / np.cos(angle / 2), abs=0.01)
+
+
 @pytest.mark.parametrize("youngs", [1e5, 1e6, 1e7])
 def test_a_rough_corner_stops_a_cube(scenes: ModuleType, youngs: float) -> None:
     course = scenes.scenes(youngs, 2)["corner of planes"]
@@ -275,12 +289,33 @@ def test_envelopes_have_their_forces_as_derivatives() -> None:
     ahead, behind = (contacts.shifted(way + sign * step * direction) for sign in (1.0, -1.0))
     slope = (ahead.energy(radius) - behind.energy(radius)) / (2.0 * step)
     assert slope == pytest.approx(-float((at.forces(radius) * direction).sum()), rel=1e-7)
-    # along the surfaces the second derivatives are those of a quadratic above e that touches it
-    along = contacts.tangential(direction)
+    # the majoriser is the second derivative but where friction is cut, and there along the normal
+    along_normal = contacts.normals * direction.sum(axis=1, keepdims=True)
+    for step_along, rows in ((direction, (cut == 0.0) | (cut == 1.0)), (along_normal, cut >= 0.0)):
+        ahead, behind = (contacts.shifted(way + sign * step * step_along) for sign in (1.0, -1.0))
+        change = (ahead.forces(radius) - behind.forces(radius)) / (2.0 * step)
+        expected = -np.einsum("mij,mj->mi", at.majoriser(radius), step_along)
+        np.testing.assert_allclose(change[rows], expected[rows], atol=1e-6 * np.abs(expected).max())
+    assert np.linalg.eigvalsh(at.majoriser(radius)).min() >= -1e-9 * contacts.stiffness.max()
+
+
+def test_quadratics_lie_above_envelopes_along_surfaces() -> None:
+    """Those of the majoriser touch e; the second derivative would not stay above it where friction is cut."""
+    rng = np.random.default_rng(6)
+    mesh = pd.shapes.box((0.2,) * 3, (2,) * 3)
+    scene = pd.Scene(pd.Solid(mesh, 1e5), pd.Ground(0.05, friction=0.5), pd.Sphere((0.1, 0.1, 0.1), 0.12, 0.3))
+    x = mesh.vertices
+    problem = step_problem(scene.values(), x, 0.0 * x, H)
+    u = 0.02 * rng.standard_normal(x.shape)
+    contacts = contacts_at(problem, u, pushes_of(problem, u, problem.gradient(u)), np.arange(len(x)))
+    radius = contacts.friction * contacts.normal_anchors
+    cut = contacts.tangent_forces(radius)[1]
+    assert ((cut > 0.0) & (cut < 1.0)).sum() > 5
+    along = contacts.tangential(rng.standard_normal((len(cut), 3)))
     for size in (1e-4, 1e-2, 1.0):
-        slope, second = at.forces(radius), at.second_derivatives(radius)
-        model = 0.5 * size**2 * np.einsum("mi,mij,mj", along, second, along) - size * float((slope * along).sum())
-        assert contacts.shifted(way + size * along).energy(radius) - at.energy(radius) <= model
+        model = 0.5 * size**2 * np.einsum("mi,mij,mj", along, contacts.majoriser(radius), along)
+        model -= size * float((contacts.forces(radius) * along).sum())
+        assert contacts.shifted(size * along).energy(radius) - contacts.energy(radius) <= model
 
 
 def test_bodies_alone_and_together_have_the_same_bits() -> None:

@@ -206,6 +206,14 @@ def test_poissons_ratio_is_studied() -> None:
         study_scene("cloth", "held")
 
 
+@pytest.mark.parametrize("subject", ["beam", "cloth"])
+def test_a_bad_material_is_refused_before_anything_is_written(subject: str, tmp_path: Path) -> None:
+    out = tmp_path / "study"
+    with pytest.raises(ValueError, match=r"poisson.*1\.5"):
+        run_study(StudyOptions(subject, poisson=1.5, quick=True, out=out), progress=False)
+    assert not out.exists()
+
+
 def test_a_tetrahedral_mesh_lands(bar: str) -> None:
     studied = study_scene(bar)
     assert studied.name == "bar.mesh"

@@ -33,7 +33,7 @@ from ..scene.solvers import Chebyshev, Multilevel, Solver
 from ..scene.stencils import StencilGroup
 from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
-from ..simulation.state import History, HistoryState, State
+from ..simulation.state import History, HistoryState, State, named_state
 from ..simulation.surface_loads import SurfaceLoads
 from .candidates import multilevel_for
 from .unsolved_step import ROUNDINGS
@@ -234,8 +234,7 @@ def _wide(tensor: Tensor) -> Tensor:
 
 
 def _wide_state(state: State | HistoryState) -> State | HistoryState:
-    kept = state if isinstance(state, HistoryState) else State(*state)
-    return kept.detach().to("cpu", torch.float64)
+    return named_state(state).detach().to("cpu", torch.float64)
 
 
 def _double(tensor: Tensor) -> Array:

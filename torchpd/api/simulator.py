@@ -151,7 +151,8 @@ class Simulator(Stepper):
             progress: show a bar.
 
         Raises:
-            ValueError: non-finite states, forces or material; a singular system; a scene without motion.
+            ValueError: non-finite states, forces or material; a singular system; a scene without motion or with
+                plastic solids.
             RuntimeError: no converged step to compare with; solver and iterations stay.
         """
         from ..accuracy.tuning import tune  # imported here, because its baselines take 0.1 s to import

@@ -216,7 +216,9 @@ def runs(solver: Solver, compiled: CompiledScene) -> bool:
         check_solver(solver, compiled.device)
     except RuntimeError:
         return False
-    return compiled.device.type != "cuda" or not isinstance(solver, Multilevel) or compiled.kernel in ("auto", "stream")
+    if compiled.device.type != "cuda" or not isinstance(solver, Multilevel):
+        return True
+    return compiled.kernel in ("auto", "stream") and not compiled.has_stencils
 
 
 def warn_of_few_iterations(compiled: CompiledScene, choice: Choice | None, changed: str | None = None) -> bool:

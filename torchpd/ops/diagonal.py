@@ -7,9 +7,21 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..common.tables import MATERIAL_TABLE
+from ..common.tables import EFFECT_ROWS, MATERIAL_TABLE, MaterialRow
 
-__all__ = ["elastic_material", "has_damping", "named_material", "pinned_vertices", "step_diagonal"]
+__all__ = [
+    "CORE_COUNT",
+    "STIFFNESS_PLACE",
+    "elastic_material",
+    "elastic_rows",
+    "has_damping",
+    "named_material",
+    "pinned_vertices",
+    "step_diagonal",
+]
+
+STIFFNESS_PLACE = [row.name for row in MATERIAL_TABLE].index("stiffness")
+CORE_COUNT = len(MATERIAL_TABLE) - len(EFFECT_ROWS)  # arrays that every scene has
 
 
 def named_material(arrays: Sequence[Tensor]) -> dict[str, Tensor]:
@@ -26,6 +38,13 @@ def elastic_material(material: Sequence[Tensor]) -> list[Tensor]:
     return [
         array if row.effect or row.name == "stiffness" else unread for row, array in zip(rows, material, strict=True)
     ]
+
+
+def elastic_rows(material: Sequence[Tensor]) -> list[tuple[MaterialRow, Tensor]]:
+    """Arrays of the material that the elastic energy depends on, with their rows of the table."""
+    rows = MATERIAL_TABLE[: len(material)]
+    pairs = zip(rows, material, strict=True)
+    return [(row, array) for row, array in pairs if row.name == "stiffness" or row.effect]
 
 
 def has_damping(material: Sequence[Tensor]) -> bool:

@@ -1,40 +1,26 @@
-"""Python side of the ops: fake kernels and derivatives. Importing this module loads the extension."""
+"""Python side of the ops: derivatives. Importing this module loads the extension."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
-from torch.utils._pytree import tree_leaves
 
-from .. import _C
-from ..common.tables import (
-    EFFECT_ROWS,
-    HISTORY_ROWS,
-    KINDS,
-    MATERIAL_TABLE,
-    MULTILEVEL_TABLE,
-    PLAN_TABLE,
-    STENCIL_TABLE,
-    MaterialRow,
-)
+from ..common.tables import MATERIAL_TABLE, MULTILEVEL_TABLE, PLAN_TABLE, STENCIL_TABLE
 from .adjoint import adjoint_fallback
-from .diagonal import named_material
+from .diagonal import CORE_COUNT, STIFFNESS_PLACE
+from .fake_kernels import INFO_WIDTH
 from .vmap import register_rule
 from .vmap_step import rollout_vjp_rule, step_vjp_rule
 
 __all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_forward_mode"]
 
-INFO_WIDTH = _C.info_numbers
-
 _ops = torch.ops.torchpd
-_STIFFNESS = [row.name for row in MATERIAL_TABLE].index("stiffness")
 _POISSON = [row.name for row in MATERIAL_TABLE].index("poisson")
 _STENCIL_PLAN = len(PLAN_TABLE) + len(STENCIL_TABLE)
-_CORE = len(MATERIAL_TABLE) - len(EFFECT_ROWS)  # arrays that every scene has
 
 
 def nearest_rotation(F: Tensor) -> Tensor:
@@ -75,217 +61,6 @@ def refuse_forward_mode(*tensors: Tensor | None) -> None:
             )
 
 
-# ---- fake kernels: shapes, types and devices only
-
-
-def _register_fake(name: str) -> Callable[[Callable[..., Any]], None]:
-    """Register a fake kernel that refuses arguments partly on "meta".
-
-    Torch also takes a fake kernel when one argument of several is on "meta", and would return uninitialised memory.
-    """
-
-    def register(kernel: Callable[..., Any]) -> None:
-        def checked(*given: Any, **settings: Any) -> Any:
-            first, *others = (leaf for leaf in tree_leaves(given) if isinstance(leaf, Tensor))
-            if first.device.type != "meta" and any(other.device.type == "meta" for other in others):
-                raise RuntimeError(
-                    f"torchpd::{name}: arguments must be on one device, got some on {first.device} and some on "
-                    '"meta", where tensors have no values'
-                )
-            return kernel(*given, **settings)
-
-        torch.library.register_fake(f"torchpd::{name}", checked)
-
-    return register
-
-
-@_register_fake("step")
-def _(positions: Tensor, velocities: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
-    info = positions.new_empty((positions.shape[0], INFO_WIDTH), dtype=torch.float64)
-    return positions.new_empty(positions.shape), positions.new_empty(velocities.shape), info
-
-
-@_register_fake("step_")
-def _(*_: Any, **__: Any) -> None:
-    return None
-
-
-@_register_fake("rollout")
-def _(positions: Tensor, *_: Any, steps: int, every: int, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
-    shape = (steps // every, *positions.shape)
-    info = positions.new_empty((*shape[:2], INFO_WIDTH), dtype=torch.float64)
-    return positions.new_empty(shape), positions.new_empty(shape), info
-
-
-@_register_fake("gradient")
-def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
-    return positions.new_empty(positions.shape)
-
-
-@_register_fake("hessian_product")
-def _(positions: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
-    return positions.new_empty(positions.shape)
-
-
-@_register_fake("element_energy")
-def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
-    return positions.new_empty((positions.shape[0], material[_STIFFNESS].shape[-1]))
-
-
-@_register_fake("element_energy_product")
-def _(positions: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
-    return positions.new_empty((positions.shape[0], material[_STIFFNESS].shape[-1]))
-
-
-@_register_fake("effect_energy")
-def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
-    return positions.new_empty(positions.shape[:1])
-
-
-@_register_fake("lame_product")
-def _(positions: Tensor, direction: Tensor | None, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
-    return positions.new_empty((*positions.shape[:1], material[_STIFFNESS].shape[-1], 2))
-
-
-@_register_fake("effect_products")
-def _(positions: Tensor, direction: Tensor | None, material: Sequence[Tensor], plan: Sequence[Tensor]) -> list[Tensor]:
-    return _fake_products(positions, material)
-
-
-def _fake_products(positions: Tensor, material: Sequence[Tensor]) -> list[Tensor]:
-    """Derivatives by the arrays that only some scenes have, of every environment."""
-    rows = zip(EFFECT_ROWS, material[_CORE:], strict=False)
-    return [positions.new_empty((len(positions), *array.shape[array.dim() - row.dims :])) for row, array in rows]
-
-
-@_register_fake("damping_gradient")
-def _(positions: Tensor, *_: Any, time_step: float) -> Tensor:
-    return positions.new_empty(positions.shape)
-
-
-@_register_fake("damping_vjp")
-def _(
-    positions: Tensor, start: Tensor, direction: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor], **_: Any
-) -> list[Tensor]:
-    by_state = [positions.new_empty(positions.shape) for _ in range(2)]
-    by_stiffness = positions.new_empty((len(positions), material[_STIFFNESS].shape[-1]))
-    return [*by_state, by_stiffness, *_fake_products(positions, material)]
-
-
-@_register_fake("next_history")
-def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor], *, time_step: float) -> list[Tensor]:
-    named = named_material(material)
-    return [positions.new_empty((len(positions), *named[row.name].shape[-2:])) for row in HISTORY_ROWS]
-
-
-@_register_fake("next_history_vjp")
-def _(
-    gradients: Sequence[Tensor], positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor], **_: Any
-) -> list[Tensor]:
-    return [positions.new_empty(positions.shape), *_fake_products(positions, material)]
-
-
-@_register_fake("elastic_diagonal")
-def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, weighted: bool, time_step: float = 0.0) -> Tensor:
-    stiffness, (_, vertex_order, *_) = material[_STIFFNESS], plan
-    own = [len(array) for row, array in _elastic_rows(material) if array.dim() > row.dims]
-    return stiffness.new_empty((*own[:1], vertex_order.shape[0]))
-
-
-@_register_fake("stiffness_at_rest")
-def _(material: Sequence[Tensor], plan: Sequence[Tensor], *, time_step: float = 0.0) -> Tensor:
-    named, stiffness = named_material(material), material[_STIFFNESS]
-    own = [len(array) for row, array in _elastic_rows(material) if array.dim() > row.dims]
-    rows = {row.name: row for row in MATERIAL_TABLE}
-    counts = [
-        named[name].shape[named[name].dim() - rows[name].dims]
-        for name, *_ in (kind.own_rows for kind in KINDS.values() if kind.own_rows)
-        if name in named
-    ]
-    # the material does not tell which tetrahedra have stencils
-    some = any(named[name].shape[-1] > 0 for name in ("poisson", "stiffness_damping") if name in named)
-    count = torch.library.get_ctx().new_dynamic_size() if some else stiffness.shape[-1] + sum(counts)
-    return stiffness.new_empty((*own[:1], count))
-
-
-@_register_fake("precondition")
-def _(field: Tensor, plan: Sequence[Tensor]) -> Tensor:
-    return field.new_empty(field.shape)
-
-
-@_register_fake("adjoint_system")
-def _(*step: Any, time_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    _, _, _, positions, _, _, material, _ = step
-    batch, vertices, _ = positions.shape
-    rows = list(zip(MATERIAL_TABLE[: len(material)], material, strict=True))
-    touching = any(row.name in ("planes", "spheres") and array.shape[-2] > 0 for row, array in rows)
-    # arrays that inertia and diagonal depend on
-    own = touching or any(
-        (row.effect or row.name in ("stiffness", "masses", "damping", "pin_stiffness"))
-        and array.dim() > row.dims
-        and len(array) != 1
-        and array.shape[1:].numel() > 0
-        for row, array in rows
-    )
-    inertia, inverse = (positions.new_empty((batch if own else 1, vertices)) for _ in range(2))
-    held = batch if touching else 0
-    projector = positions.new_empty((held, vertices, 3, 3))
-    stuck = positions.new_empty((held, vertices), dtype=torch.bool)
-    sliding = positions.new_empty((held, vertices, _C.slide_vectors, 3))
-    return positions.new_empty(positions.shape), inertia, inverse, projector, stuck, sliding
-
-
-@_register_fake("contact_gradients")
-def _(multiplier: Tensor, *step: Any, time_step: float) -> tuple[Tensor, Tensor]:
-    material = named_material(step[-2])
-    planes, spheres = (
-        multiplier.new_empty((len(multiplier), *material[name].shape[-2:])) for name in ("planes", "spheres")
-    )
-    return planes, spheres
-
-
-@_register_fake("conjugate_gradients")
-def _(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
-    return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)
-
-
-@_register_fake("adjoint_fallback")
-def _(solution: Tensor, *_: Any, **__: Any) -> Tensor:
-    return solution.new_empty(solution.shape)
-
-
-def _fake_vjp(*call: Any, time_step: float, wanted: Sequence[bool] | None = None) -> list[Tensor]:
-    *_, positions, _, _, material, _ = call
-    state = [positions.new_empty(positions.shape) for _ in range(3)]
-    asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
-    return [*state, *(array.new_empty(array.shape) for array, own in asked if own)]
-
-
-for _name in ("step_vjp", "rollout_vjp"):
-    _register_fake(_name)(_fake_vjp)
-
-
-@_register_fake("adjoint_result")
-def _(multiplier: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
-    x, v, out = (multiplier.new_empty(multiplier.shape) for _ in range(3))
-    return x, v, out
-
-
-@_register_fake("conjugate_gradients_")
-def _(*_: Any, **__: Any) -> None:
-    return None
-
-
-@_register_fake("nearest_rotation")
-def _(matrices: Tensor) -> Tensor:
-    return matrices.new_empty(matrices.shape)
-
-
-@_register_fake("rotation_differential")
-def _(matrices: Tensor, direction: Tensor) -> Tensor:
-    return matrices.new_empty(matrices.shape)
-
-
 # ---- kernels
 
 
@@ -313,28 +88,21 @@ def _sum_to_stiffness(per_environment: Tensor, stiffness: Tensor) -> Tensor:
 
 
 def _with_stiffness(material: Sequence[Tensor], stiffness: Tensor) -> list[Tensor]:
-    return [stiffness if place == _STIFFNESS else array for place, array in enumerate(material)]
-
-
-def _elastic_rows(material: Sequence[Tensor]) -> list[tuple[MaterialRow, Tensor]]:
-    """Arrays of the material that the elastic energy depends on, with their rows of the table."""
-    rows = MATERIAL_TABLE[: len(material)]
-    pairs = zip(rows, material, strict=True)
-    return [(row, array) for row, array in pairs if row.name == "stiffness" or row.effect]
+    return [stiffness if place == STIFFNESS_PLACE else array for place, array in enumerate(material)]
 
 
 def _for_material(
     material: Sequence[Tensor], stiffness: Tensor | None, effects: Sequence[Tensor | None] | None = None
 ) -> list[Tensor | None]:
     """Gradients of the material: stiffness and effects enter the elastic energy."""
-    count = len(material) - _CORE
-    grads: list[Tensor | None] = [stiffness if place == _STIFFNESS else None for place in range(_CORE)]
+    count = len(material) - CORE_COUNT
+    grads: list[Tensor | None] = [stiffness if place == STIFFNESS_PLACE else None for place in range(CORE_COUNT)]
     return [*grads, *([None] * count if effects is None else effects)]
 
 
 def _sum_to_rows(material: Sequence[Tensor], each: Sequence[Tensor]) -> list[Tensor | None]:
     """Gradients of the effects from those of every environment."""
-    shared = zip(MATERIAL_TABLE[_CORE:], material[_CORE:], each, strict=True)
+    shared = zip(MATERIAL_TABLE[CORE_COUNT:], material[CORE_COUNT:], each, strict=True)
     return [
         None if array.numel() == 0 else grad.sum(0) if array.dim() == row.dims else grad.sum_to_size(array.shape)
         for row, array, grad in shared
@@ -343,12 +111,12 @@ def _sum_to_rows(material: Sequence[Tensor], each: Sequence[Tensor]) -> list[Ten
 
 def _effect_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
     positions, *material = ctx.saved_tensors
-    stiffness, x, w, effects = material[_STIFFNESS], None, None, None
+    stiffness, x, w, effects = material[STIFFNESS_PLACE], None, None, None
     if ctx.needs_input_grad[0]:
         x = grad[:, None, None] * _ops.gradient(positions, material, ctx.plan)
-    if ctx.needs_input_grad[1][_STIFFNESS]:
+    if ctx.needs_input_grad[1][STIFFNESS_PLACE]:
         w = _sum_to_stiffness(grad[:, None] * _by_stiffness(positions, None, material, ctx.plan), stiffness)
-    if any(ctx.needs_input_grad[1][_CORE:]):
+    if any(ctx.needs_input_grad[1][CORE_COUNT:]):
         products = _ops.effect_products(positions, None, material, ctx.plan)
         each = [grad.view(-1, *[1] * (product.dim() - 1)) * product for product in products]
         effects = _sum_to_rows(material, each)
@@ -362,7 +130,7 @@ def _by_stiffness(
     if _has_poisson(material):
         lame: Tensor = _ops.lame_product(positions, direction, material, plan)
         return lame[..., 0]
-    unit = _with_stiffness(material, torch.ones_like(material[_STIFFNESS]))
+    unit = _with_stiffness(material, torch.ones_like(material[STIFFNESS_PLACE]))
     found: Tensor
     if direction is None:
         found = _ops.element_energy(positions, unit, plan)
@@ -372,7 +140,7 @@ def _by_stiffness(
 
 
 def _has_poisson(material: Sequence[Tensor]) -> bool:
-    return len(material) > _CORE and material[_POISSON].shape[-1] > 0
+    return len(material) > CORE_COUNT and material[_POISSON].shape[-1] > 0
 
 
 def _refuse_poisson(material: Sequence[Tensor]) -> None:
@@ -386,7 +154,7 @@ def _refuse_poisson(material: Sequence[Tensor]) -> None:
 
 def _tets_alone(material: Sequence[Tensor], stiffness: Tensor) -> list[Tensor]:
     """The material with another stiffness, for a plan without stencils."""
-    return _with_stiffness(material, stiffness)[:_CORE]
+    return _with_stiffness(material, stiffness)[:CORE_COUNT]
 
 
 def _without_stencils(plan: Sequence[Tensor]) -> list[Tensor]:
@@ -403,10 +171,10 @@ def _for_plan(ctx: Any) -> list[None]:
 def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
     positions, *material = ctx.saved_tensors
     _refuse_poisson(material)
-    stiffness, x, w = material[_STIFFNESS], None, None
+    stiffness, x, w = material[STIFFNESS_PLACE], None, None
     if ctx.needs_input_grad[0]:
         x = _ops.gradient(positions, _tets_alone(material, grad * stiffness), _without_stencils(ctx.plan))
-    if ctx.needs_input_grad[1][_STIFFNESS]:
+    if ctx.needs_input_grad[1][STIFFNESS_PLACE]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
         w = _sum_to_stiffness(grad * _ops.element_energy(positions, unit, ctx.plan), stiffness)
     return x, _for_material(material, w), _for_plan(ctx)
@@ -414,12 +182,12 @@ def _element_energy_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, lis
 
 def _gradient_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, list[Tensor | None], list[None]]:
     positions, *material = ctx.saved_tensors
-    stiffness, x, w, effects = material[_STIFFNESS], None, None, None
+    stiffness, x, w, effects = material[STIFFNESS_PLACE], None, None, None
     if ctx.needs_input_grad[0]:
         x = _ops.hessian_product(positions, grad, material, ctx.plan)
-    if ctx.needs_input_grad[1][_STIFFNESS]:
+    if ctx.needs_input_grad[1][STIFFNESS_PLACE]:
         w = _sum_to_stiffness(_by_stiffness(positions, grad, material, ctx.plan), stiffness)
-    if any(ctx.needs_input_grad[1][_CORE:]):
+    if any(ctx.needs_input_grad[1][CORE_COUNT:]):
         effects = _sum_to_rows(material, _ops.effect_products(positions, grad, material, ctx.plan))
     return x, _for_material(material, w, effects), _for_plan(ctx)
 
@@ -446,7 +214,7 @@ def _save_damping(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[s
 def _damping_backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, list[Tensor | None], list[None]]:
     positions, start, *material = ctx.saved_tensors
     x, before, w, *effects = _ops.damping_vjp(positions, start, grad, material, ctx.plan, time_step=ctx.time_step)
-    stiffness = _sum_to_stiffness(w, material[_STIFFNESS])
+    stiffness = _sum_to_stiffness(w, material[STIFFNESS_PLACE])
     return x, before, _for_material(material, stiffness, _sum_to_rows(material, effects)), _for_plan(ctx)
 
 
@@ -455,13 +223,13 @@ def _element_energy_product_backward(
 ) -> tuple[Tensor | None, Tensor | None, list[Tensor | None], list[None]]:
     positions, direction, *material = ctx.saved_tensors
     _refuse_poisson(material)
-    stiffness, x, d, w = material[_STIFFNESS], None, None, None
+    stiffness, x, d, w = material[STIFFNESS_PLACE], None, None, None
     scaled, plan = _tets_alone(material, grad * stiffness), _without_stencils(ctx.plan)
     if ctx.needs_input_grad[0]:
         x = _ops.hessian_product(positions, direction, scaled, plan)
     if ctx.needs_input_grad[1]:
         d = _ops.gradient(positions, scaled, plan)
-    if ctx.needs_input_grad[2][_STIFFNESS]:
+    if ctx.needs_input_grad[2][STIFFNESS_PLACE]:
         unit = _with_stiffness(material, torch.ones_like(stiffness))
         w = _sum_to_stiffness(grad * _ops.element_energy_product(positions, direction, unit, ctx.plan), stiffness)
     return x, d, _for_material(material, w), _for_plan(ctx)
@@ -469,7 +237,7 @@ def _element_energy_product_backward(
 
 def _hessian_product_backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor | None, list[Tensor | None], list[None]]:
     wanted = ctx.needs_input_grad[2]
-    if ctx.needs_input_grad[0] or wanted[_STIFFNESS] or any(wanted[_CORE:]):
+    if ctx.needs_input_grad[0] or wanted[STIFFNESS_PLACE] or any(wanted[CORE_COUNT:]):
         raise RuntimeError(
             "torchpd: third derivatives of the elastic energy are not provided; detach positions and stiffness before "
             "differentiating a Hessian-vector product"
@@ -485,7 +253,7 @@ def _save_nothing(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[s
 
 def _diagonal_backward(ctx: Any, grad: Tensor) -> tuple[list[None], list[None]]:
     wanted, of_plan = ctx.needs_input_grad
-    if wanted[_STIFFNESS] or any(wanted[_CORE:]):
+    if wanted[STIFFNESS_PLACE] or any(wanted[CORE_COUNT:]):
         raise RuntimeError("torchpd: the elastic diagonal, a preconditioner, has no derivative; detach stiffness")
     return [None] * len(wanted), [None] * len(of_plan)
 

@@ -6,8 +6,9 @@ that pairs join. Elastic energy does not change, so q minimises
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
 with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
-An outer step minimises the quadratic model of Phi by Newton passes, and moves r toward friction l in between. It halves
-the motion until Phi has not risen. The pushes p of the touching vertices follow. At a converged step q = 0 and p = 0.
+An outer step minimises Phi with gaps and slips to first order, which is convex: Newton's steps, each ended by an exact
+search, and r moves toward friction l in between. The outer step halves the motion until Phi has not risen. The pushes p
+of the touching vertices follow, contact by contact. At a converged step q = 0 and p = 0.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from .envelopes import Envelopes, PairContacts, contacts_at
 from .geometry import twists
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
 
@@ -50,7 +51,7 @@ class Motions(ABC):
     All sums run over the vertices of the island alone, so that their bits do not depend on other bodies.
     """
 
-    problem: StepProblem
+    problem: Objective
     displacement: Array  # [V, 3] m, of the whole scene
     bodies: tuple[Index, ...]  # vertices of every body
 
@@ -107,7 +108,7 @@ class Motions(ABC):
 
 @dataclass(frozen=True)
 class RigidMotions(Motions):
-    """Twists (v, w) of the bodies: y = c + exp([w]x) (y - c) + v with the centre c, and sum a / 2 |u - s|^2."""
+    """Twists (v, w) of the bodies, and sum a / 2 |u - s|^2: y = c + R (y - c) + v, R about w by 2 atan(|w| / 2)."""
 
     @cached_property
     def bases(self) -> list[tuple[Array, Array]]:
@@ -176,6 +177,8 @@ class RigidMotions(Motions):
         """Largest of |v| / l + |w| over the bodies, l^2 the mean of |arm|^2 by a."""
         shares = [0.0]
         for own, arms, basis, _, columns in self.parts:
+            if not basis.shape[1]:
+                continue
             weight, twist = self.problem.weight[own], basis @ motion[columns]
             size = float(np.sqrt(weight @ (arms**2).sum(axis=1) / weight.sum()))
             shares.append(float(np.linalg.norm(twist[:3])) / size + float(np.linalg.norm(twist[3:])))
@@ -196,7 +199,7 @@ class RigidMotions(Motions):
 
 
 # makes the motions of an island from the problem, the displacement and the vertices of its bodies
-MotionsOf = Callable[["StepProblem", Array, tuple[Index, ...]], Motions]
+MotionsOf = Callable[["Objective", Array, tuple[Index, ...]], Motions]
 
 
 class Correction(NamedTuple):
@@ -205,10 +208,11 @@ class Correction(NamedTuple):
     displacement: Array  # [V, 3] m
     forces: Array  # [m, 3] N of the pairs
     energies: Array  # [components] J: Phi of its island, before the pushes; inf where pins leave no motion
+    pushes: Array  # [V, 3] m: after the motion, by the contacts and the projection
 
 
 def correct(
-    problem: StepProblem,
+    problem: Objective,
     displacement: Array,
     forces: Array,
     pairs: PairContacts | None = None,
@@ -225,18 +229,19 @@ def correct(
         motions: makes the motions of an island.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
-    energies = np.full(int(problem.values.component.max()) + 1, np.inf)
+    energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
     for bodies, of in islands(problem, pairs):
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, each, energy = _correct_island(moving, forces, own)
+        corrected, push, each, energy = _correct_island(moving, forces, own)
+        pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
         energies[problem.values.component[[body[0] for body in bodies]]] = energy
-    return Correction(corrected, after, energies)
+    return Correction(corrected, after, energies, pushes)
 
 
-def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
+def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
     """The bodies of every island, as their vertices, and the numbers of its pairs."""
     component = problem.values.component
     ends = np.zeros((0, 2), np.int64) if pairs is None else component[pairs.vertices[:, [0, 3]]]
@@ -249,15 +254,14 @@ def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, float]:
-    """Displacement [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
+def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, Array, float]:
+    """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
-    phi = motions.energy + contacts.energy(radius)
     for _ in range(OUTER):
         motion, radius = _model_minimum(motions, contacts, radius)
-        energy = motions.energy + contacts.energy(radius)
+        phi = energy = motions.energy + contacts.energy(radius)
         for _ in range(CUTS + 1):
             trial = motions.after(motion)
             after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
@@ -272,7 +276,7 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
         motions, contacts, phi = trial, after, reached
         if share <= STILL:
             break
-    return _pushed(motions, contacts, radius), contacts.forces(radius), phi
+    return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
 def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
@@ -284,23 +288,32 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
 
-    def slope(motion: Array, step: Array) -> float:
-        forces = contacts.shifted(jacobian @ motion).forces(radius)
-        return float((gradient + hessian @ motion) @ step - ((jacobian @ step) * forces).sum())
-
     for _ in range(PASSES):
         trial = contacts.shifted(jacobian @ motion)
-        second = trial.second_derivatives(radius)
+        second = trial.majoriser(radius)
         on = second.any(axis=(1, 2))
         matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
         force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion
         # a line has no inertia about itself
         step = np.linalg.lstsq(matrix, force, rcond=1e-12)[0]
+        way, linear, quadratic = jacobian @ step, float(force @ step), float(step @ hessian @ step)
+        linear -= float((way * trial.forces(radius)).sum())
+
+        def slope(
+            share: float,
+            trial: Envelopes = trial,
+            way: Array = way,
+            linear: float = linear,
+            quadratic: float = quadratic,
+            radius: Array = radius,
+        ) -> float:
+            return share * quadratic - linear - float((way * trial.shifted(share * way).forces(radius)).sum())
+
         low, high = 0.0, 1.0
-        if slope(motion + step, step) > 1e-9 * abs(slope(motion, step)):
-            for _ in range(40):
+        if slope(1.0) > 1e-9 * abs(slope(0.0)):
+            for _ in range(30):
                 middle = 0.5 * (low + high)
-                low, high = (middle, high) if slope(motion + middle * step, step) < 0.0 else (low, middle)
+                low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
         motion, share = motion + high * step, motions.share(high * step)
         lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
         if share <= STILL and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
@@ -310,8 +323,8 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
     return motion, radius
 
 
-def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
-    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island.
+def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island, and these changes.
 
     A vertex that touches several planes and spheres is pushed by one after another.
     """
@@ -329,7 +342,7 @@ def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
         pushed = pushed + np.where(problem.free[:, None], forces / problem.diagonal[:, None], 0.0)
     moved = motions.displacement.copy()
     moved[own] = problem.project(pushed)[own]
-    return moved
+    return moved, moved - motions.displacement
 
 
 def _cross(vectors: Array) -> Array:

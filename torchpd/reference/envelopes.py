@@ -22,7 +22,7 @@ from ..common.tables import PLANES, SPHERES
 from .geometry import sphere_normals
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["Envelopes", "PairContacts", "contacts_at", "pushes_of"]
 
@@ -95,8 +95,11 @@ class Envelopes:
         huber = np.where(share > 0.0, size**2 * (1.0 / np.maximum(share, 1e-300) - 0.5), 0.0)
         return float(((0.5 * self.normal_forces() ** 2 + huber) / self.stiffness).sum())
 
-    def second_derivatives(self, radius: Array) -> Array:
-        """Derivatives of -f by the relative displacement [m, 3, 3] N/m for a fixed radius; positive semidefinite."""
+    def majoriser(self, radius: Array) -> Array:
+        """Second derivatives [m, 3, 3] N/m, for a fixed radius, of a quadratic above e that touches it.
+
+        Along a slip that is cut they are r / |b| k, not 0: Newton's step stops where friction begins to hold.
+        """
         n, share = self.normals, self.tangent_forces(radius)[1]
         normal = n[:, :, None] * n[:, None, :]
         pushed = (self.normal_forces() > 0.0)[:, None, None]
@@ -105,7 +108,7 @@ class Envelopes:
 
 
 def contacts_at(
-    problem: StepProblem, displacement: Array, forces: Array, vertices: Index, pairs: PairContacts | None = None
+    problem: Objective, displacement: Array, forces: Array, vertices: Index, pairs: PairContacts | None = None
 ) -> Envelopes:
     """Contacts of free vertices with all planes and spheres, then the pairs, at an iterate.
 
@@ -154,7 +157,7 @@ def contacts_at(
     return replace(contacts, slips=along(contacts.slips), tangent_anchors=along(anchors))
 
 
-def pushes_of(problem: StepProblem, displacement: Array, gradient: Array) -> Array:
+def pushes_of(problem: Objective, displacement: Array, gradient: Array) -> Array:
     """Forces [C, V, 3] N of every plane and sphere in the next plain iteration: D times what P(u - g / D) moves."""
     scale = problem.diagonal[:, None]
     before, forces = displacement - gradient / scale, []

@@ -14,7 +14,7 @@ from .coarse import Motions, MotionsOf
 from .pieces import Pieces, PieceSpace
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["PieceCycle", "PieceMotions", "piece_motions"]
 
@@ -63,7 +63,6 @@ class PieceMotions(Motions):
         for name, value in (("modes", self.modes), ("hessian", self.hessian), ("columns", self.columns)):
             moved.__dict__[name] = value
         moved.__dict__["gradient"] = self.gradient + self.hessian @ motion
-        moved.__dict__["energy"] = self.energy + float((self.gradient + 0.5 * self.hessian @ motion) @ motion)
         return moved
 
     @cached_property
@@ -86,7 +85,7 @@ class PieceCycle:
     M alone; there, and after every `every` further iterations, Z, Hc and Ac are made anew. The secant pairs stay.
     """
 
-    problem: StepProblem
+    problem: Objective
     cycle: Callable[[Array], Array]  # applies M
     pieces: Pieces
     every: int = 0  # 0: made once

@@ -22,7 +22,7 @@ from .groups import ElementGroup
 from .laws import Coupling
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["PieceSpace", "Pieces", "cut"]
 
@@ -49,7 +49,7 @@ class Pieces:
         return int(self.weights.shape[1])
 
 
-def cut(problem: StepProblem, size: int = 25, most: int = MOST, blend: int = BLEND) -> Pieces:
+def cut(problem: Objective, size: int = 25, most: int = MOST, blend: int = BLEND) -> Pieces:
     """Cut every component into pieces of about `size` vertices, and at most `most` pieces.
 
     Lloyd's method, with distances along the couplings of A; weak couplings are long, so that pieces follow the
@@ -68,7 +68,7 @@ def cut(problem: StepProblem, size: int = 25, most: int = MOST, blend: int = BLE
     return Pieces(of, _blended(problem, of, count, blend))
 
 
-def _blended(problem: StepProblem, of: Index, count: int, sweeps: int) -> csr_array:
+def _blended(problem: Objective, of: Index, count: int, sweeps: int) -> csr_array:
     """Weights [V, P] of pieces: one in each, then smoothed and scaled to add up to one."""
     free = np.flatnonzero(problem.free)
     weights = csr_array((np.ones(len(free)), (free, of[free])), shape=(len(of), count))
@@ -82,7 +82,7 @@ def _blended(problem: StepProblem, of: Index, count: int, sweeps: int) -> csr_ar
     return weights
 
 
-def _lengths(problem: StepProblem, own: Index) -> csr_array:
+def _lengths(problem: Objective, own: Index) -> csr_array:
     """Graph of the couplings of some vertices: distance / clip(strength / upper quartile, 0.01, 1) [m]."""
     matrix = coo_array(problem.matrix[own][:, own])
     apart = (matrix.row != matrix.col) & (matrix.data != 0.0)
@@ -139,7 +139,7 @@ def _deepest(graph: csr_array, label: Index, centres: Index) -> Index:
 class PieceSpace:
     """The coarse space of pieces at an iterate, and the matrices of the step reduced to it: N unknowns."""
 
-    problem: StepProblem
+    problem: Objective
     pieces: Pieces
     displacement: Array  # [V, 3] m, where it was made
 

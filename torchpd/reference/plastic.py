@@ -54,8 +54,8 @@ def flow(law: PlasticLaw, elastic: Array, state: Flow, time_step: float) -> Flow
     """The state after a step that ended with F_e [N, 3, 3].
 
     With F_e = U S V^T, d is the deviator of log S and n = d / |d|. The flow gamma of the step is the share of creep
-    times max(0, |d| - (yield + H alpha)) / (1 + H). Then Fp <- V exp(gamma n) V^T Fp and alpha <- alpha + gamma.
-    Nothing flows where det F_e <= 0.
+    times max(0, |d| - (yield + H alpha)) / (1 + H). Then Fp <- V exp(gamma n) V^T Fp, divided by the cube root of its
+    determinant, and alpha <- alpha + gamma. Nothing flows where det F_e <= 0.
     """
     _, values, right = singular_frames(elastic)
     sound = values[:, 2] > 0.0
@@ -66,7 +66,8 @@ def flow(law: PlasticLaw, elastic: Array, state: Flow, time_step: float) -> Flow
     gamma = np.where(sound, excess / (1.0 + law.hardening) * law.share(time_step), 0.0)
     stretch = np.exp(gamma[:, None] * deviator / np.where(size > 0.0, size, 1.0)[:, None])
     plastic = np.swapaxes(right, 1, 2) @ (stretch[:, :, None] * right) @ state.plastic
-    return Flow(_bounded(plastic, law.max_flow), state.hardening + gamma)
+    root = np.where(gamma > 0.0, np.cbrt(np.linalg.det(plastic)), 1.0)
+    return Flow(_bounded(plastic / root[:, None, None], law.max_flow), state.hardening + gamma)
 
 
 def _bounded(plastic: Array, most: float) -> Array:

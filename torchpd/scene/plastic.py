@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..common.checks import as_array, check_finite
+from ..common.checks import as_array, check_finite, check_shape
 from ..common.synonyms import check_arguments
-from .part import ArrayLike, ScenePart, per_item, set_fields
+from .part import ArrayLike, ScenePart, set_fields
 
 __all__ = ["Plastic"]
 
@@ -37,7 +37,7 @@ class Plastic(ScenePart):
             positive.
         hardening: H, rise of y per flow alpha, a scalar or [E], >= 0. 0: perfectly plastic.
         creep_time: tau [s], in which excess strain flows, a scalar or [E]. 0: within the step.
-        max_flow: largest |log s| of the stretches s of Fp, a scalar or [E], positive. None: no bound.
+        max_flow: largest |log s| of the stretches s of Fp, a scalar or [E], positive. inf: no bound.
 
     Example:
         >>> steel = Solid(mesh, youngs=1e6, poisson=0.3, plastic=Plastic(0.02, hardening=0.1))
@@ -46,7 +46,7 @@ class Plastic(ScenePart):
     yield_strain: Array  # [] or [E], like the others
     hardening: Array
     creep_time: Array
-    max_flow: Array | None
+    max_flow: Array
 
     @check_arguments("Plastic")
     def __init__(
@@ -54,34 +54,33 @@ class Plastic(ScenePart):
         yield_strain: ArrayLike,
         hardening: ArrayLike = 0.0,
         creep_time: ArrayLike = 0.0,
-        max_flow: ArrayLike | None = None,
+        max_flow: ArrayLike = np.inf,
     ) -> None:
         set_fields(
             self,
             yield_strain=_numbers("yield_strain", yield_strain),
             hardening=_numbers("hardening", hardening, zero=True),
             creep_time=_numbers("creep_time", creep_time, zero=True),
-            max_flow=None if max_flow is None else _numbers("max_flow", max_flow),
+            max_flow=_numbers("max_flow", max_flow, infinite=True),
         )
 
     def rows(self, count: int) -> dict[str, Array]:
         """Rows of the material of that many tetrahedra, and their flow at rest."""
-        most = np.array(np.inf) if self.max_flow is None else self.max_flow
         return {
             "yield_strain": _per_tet("yield_strain", self.yield_strain, count),
             "hardening": _per_tet("hardening", self.hardening, count),
             "creep_time": _per_tet("creep_time", self.creep_time, count, unit="s"),
-            "max_flow": np.full(count, np.inf) if np.isinf(most).all() else _per_tet("max_flow", most, count),
+            "max_flow": _per_tet("max_flow", self.max_flow, count),
             "flow": np.tile(_AT_REST, (count, 1)),
         }
 
 
-def _numbers(name: str, value: Any, *, zero: bool = False) -> Array:
+def _numbers(name: str, value: Any, *, zero: bool = False, infinite: bool = False) -> Array:
     full = f"Plastic.{name}"
     array = as_array(full, value, np.float64)
     if array.ndim > 1:
         raise ValueError(f"{full} must be a scalar or one value per tetrahedron [E], got {list(array.shape)}")
-    check_finite(full, array)
+    check_finite(full, np.where(np.isinf(array), np.sign(array), array) if infinite else array)
     bad = np.flatnonzero((array < 0.0) if zero else (array <= 0.0))
     if bad.size:
         wanted = ">= 0" if zero else "positive"
@@ -92,4 +91,6 @@ def _numbers(name: str, value: Any, *, zero: bool = False) -> Array:
 
 
 def _per_tet(name: str, array: Array, count: int, unit: str = "1") -> Array:
-    return per_item(f"Plastic.{name}", array, count, of="tetrahedron", unit=unit, zero=True)
+    if array.ndim:
+        check_shape(f"Plastic.{name}", array, (count,), f"one value per tetrahedron or a scalar [{unit}]")
+    return np.broadcast_to(array, (count,))

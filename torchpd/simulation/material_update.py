@@ -90,6 +90,9 @@ def check_change(
             names = ", ".join([*own, *COLUMNS])
             raise TypeError(f"{owner}: no array {name!r}; there are {names}{_hint(name)}")
     arrays = _expand_columns(own, owner, arrays)
+    for name, value in arrays.items():
+        if own[name].numel() == 0:
+            _refuse_values(owner, name, value)
     replaces_hard, hard = PIN_HARD in arrays, arrays.pop(PIN_HARD, False)
     checked = {name: check_array(owner, name, value, own[name]) for name, value in arrays.items()}
     for name, value in arrays.items():
@@ -124,6 +127,16 @@ def check_change(
         return MaterialChange(checked, originals, replaced, _updated_plan(compiled, own, checked), new_trainable)
 
 
+def _refuse_values(owner: str, name: str, value: Tensor | float) -> None:
+    """Refuse values of an array without rows, which would have no effect."""
+    tensor = value if isinstance(value, Tensor) else None
+    if name != PIN_HARD:
+        tensor = real_tensor(owner, name, value)
+    if tensor is None or tensor.numel() > 0:
+        came = repr(value) if tensor is None or tensor.dim() == 0 else list(tensor.shape)
+        raise ValueError(f"{owner}: {name} has no rows in this scene, so it must be left out, got {came}{_hint(name)}")
+
+
 def _check_damped(owner: str, seconds: Tensor, scene: Scene) -> None:
     """Refuse damping of tetrahedra whose solid has none compiled in."""
     given = (seconds.detach().cpu() != 0.0).reshape(-1, seconds.shape[-1]).any(0).numpy()
@@ -136,7 +149,9 @@ def _check_damped(owner: str, seconds: Tensor, scene: Scene) -> None:
 
 
 def _hint(name: str) -> str:
-    """What to do instead of setting an array that a scene lacks."""
+    """What to do instead of setting an array that a scene lacks, or of which it has no rows."""
+    if name == "stiffness":
+        return "; it is that of elastic solids. Plastic solids have plastic_youngs, cloth has membrane_youngs"
     if name == "poisson":
         return (
             "; every elastic solid has poisson=0.0, which leaves it out: give Solid(poisson=) another number or an "

@@ -170,7 +170,9 @@ class Readable(Model):
             state: a `HistoryState`.
         """
         self.check_state(state)
-        return plastic_strain(self.scene, state.history.flow) if self.keeps_history else {}
+        if not self.keeps_history:
+            return {}
+        return plastic_strain(self.scene, named_material(self.with_history(self.material(), state))["flow"])
 
     def membrane_stress(self, state: State | HistoryState | Tensor) -> dict[Cloth, MembraneStress]:
         """Cauchy stress [N/m] of every triangle by cloth, membrane and threads together, with its strain.

@@ -60,8 +60,8 @@ class RigidPieces:
             and the highest, which must differ by a factor of 100.
 
     Raises:
-        ValueError: contacts, cloth, rods or a Poisson's ratio in the scene, no free piece, more than 256 pieces, or too
-            little memory.
+        ValueError: contacts, cloth, rods, plastic solids or a Poisson's ratio in the scene, no free piece, more than
+            256 pieces, or too little memory.
     """
 
     def __init__(self, sim: Stepper, *, stiffer_than: float | None = None) -> None:

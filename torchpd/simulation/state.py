@@ -14,7 +14,7 @@ from ..common.reprs import by_sizes
 if TYPE_CHECKING:
     from ..scene.targets import Targets
 
-__all__ = ["History", "HistoryState", "HistoryTrack", "Info", "State", "StepCall", "Track"]
+__all__ = ["History", "HistoryState", "HistoryTrack", "Info", "State", "StepCall", "Track", "named_state"]
 
 
 class State(NamedTuple):
@@ -58,7 +58,7 @@ class History(NamedTuple):
     flow: Tensor  # [B, P, 10] of plastic tetrahedra: Fp, row by row, and alpha (see `Plastic`)
 
     def __repr__(self) -> str:
-        return by_sizes(self, self.flow, "batch", "plastic", trailing=1)
+        return by_sizes(self, self.flow, "records", "batch", "plastic")
 
 
 class HistoryState(NamedTuple):
@@ -107,10 +107,26 @@ def _dense_copy(tensor: Tensor) -> Tensor:
     return tensor.clone(memory_format=torch.contiguous_format)
 
 
-def _named(state: State | HistoryState) -> dict[str, Tensor]:
+def named_state(state: Any) -> State | HistoryState:
+    """A state with named parts, from any tuple or list that a step takes."""
+    if len(state) == len(State._fields):
+        return State(*state)
+    positions, velocities, history = state
+    return HistoryState(positions, velocities, History(*history))
+
+
+def _has_history(state: Any) -> bool:
+    """Whether the third part, if there is one, is a history or a tuple or list of its parts."""
+    return len(state) == len(State._fields) or (
+        isinstance(state[2], (tuple, list)) and len(state[2]) == len(History._fields)
+    )
+
+
+def _tensors_by_name(state: Any) -> dict[str, Tensor]:
     """The tensors of a state by name."""
-    named = {"positions": state.positions, "velocities": state.velocities}
-    return named | state.history._asdict() if isinstance(state, HistoryState) else named
+    whole = named_state(state)
+    named = {"positions": whole.positions, "velocities": whole.velocities}
+    return named | whole.history._asdict() if isinstance(whole, HistoryState) else named
 
 
 def _where(state: _Some, condition: Any, other: Any) -> _Some:
@@ -123,10 +139,10 @@ def _where(state: _Some, condition: Any, other: Any) -> _Some:
             f"{kind.__name__}.where: condition must be bool [{len(state.positions)}], one for each environment, got "
             f"{condition.dtype} {list(condition.shape)}"
         )
-    if not isinstance(other, (tuple, list)) or len(other) != len(state):
+    if not isinstance(other, (tuple, list)) or len(other) != len(state) or not _has_history(other):
         raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__}, got {type(other).__name__}")
-    theirs_of = _named(kind(*other))
-    for name, mine in _named(state).items():
+    theirs_of = _tensors_by_name(other)
+    for name, mine in _tensors_by_name(state).items():
         theirs = theirs_of[name]
         if theirs.dtype != mine.dtype or theirs.device != mine.device:
             raise TypeError(

@@ -12,6 +12,7 @@ for segments of rods and for springs, in this order. Files have these fields, th
             von_mises         of tetrahedra [Pa], NaN in inverted ones; both absent where a solid has a strain limit
                               or law="volume"
             fibre_tension     of tetrahedra [Pa], the sum over their fibres
+            plastic_strain    flow alpha of tetrahedra, 0 in elastic ones
             membrane_stress   of triangles [N/m], larger and smaller principal value, NaN in collapsed ones; absent
                               where a cloth has a strain limit
             tension           of lines [N]
@@ -45,7 +46,7 @@ from ..scene.fibres import Fibres
 from ..scene.part import Body
 from ..scene.scene import Scene
 from ..scene.springs import Springs
-from .state import HistoryState, HistoryTrack, State, Track
+from .state import HistoryState, HistoryTrack, State, Track, named_state
 from .stencil_readouts import forces_on_tied, has_membrane_stress, membrane_stress, tensions
 from .stress import STRESS_ROWS, has_stress, plastic_strain, stress
 
@@ -121,7 +122,7 @@ def _records(
     names = {"stiffness", *(row.name for row in EFFECT_ROWS)} & compiled.named.keys()
     elastic = {name: compiled.named[name] for name in sorted(names)}
     check_environments("write_vtu: states", len(found[0][0]), elastic)
-    return [HistoryState(*state) if len(state) > 2 else State(*state) for state in found], alone
+    return [named_state(state) for state in found], alone
 
 
 def _chosen(environment: int | None, batch: int) -> int:

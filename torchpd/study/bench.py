@@ -19,6 +19,7 @@ from ..common.warn import warn_user
 from ..files.summary import workspace_bytes
 from ..geometry.tet_mesh import TetMesh
 from ..geometry.tri_mesh import TriMesh
+from ..scene.scene import Scene
 from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver
 from ..simulation.state import State
 from .results_log import Row, Trajectory
@@ -87,13 +88,16 @@ class Bench:
         mesh = self.mesh(resolution)
         return len(mesh.tets if isinstance(mesh, TetMesh) else mesh.triangles)
 
+    def scene(self, setting: Setting) -> Scene:
+        """The study scene at a setting."""
+        return self.study_scene.scene(self.mesh(setting.resolution), setting.youngs)
+
     def simulator(
         self, setting: Setting, dtype: torch.dtype, solver: Solver | None = None, **options: Any
     ) -> Simulator:
         """A new simulator on the device."""
-        scene = self.study_scene.scene(self.mesh(setting.resolution), setting.youngs)
         chosen = {"iterations": DEFAULT_ITERATIONS, "batch": 1, **options}
-        sim = Simulator(scene, setting.time_step, solver=solver, dtype=dtype, progress=False, **chosen)
+        sim = Simulator(self.scene(setting), setting.time_step, solver=solver, dtype=dtype, progress=False, **chosen)
         return sim.to(self.device)
 
     def start(self, sim: Simulator) -> State:

@@ -163,6 +163,7 @@ def study_rows(options: StudyOptions, *, progress: bool = True) -> list[Row]:
         torch.set_num_threads(options.threads)
     bench = Bench(studied, device, series=1, seconds=0.0) if options.quick else Bench(studied, device)
     setting = _setting(studied, options)
+    bench.scene(setting)  # refuses its material before anything is written
     options.out.mkdir(parents=True, exist_ok=True)
     settings = {
         "schema": SCHEMA, "subject": options.subject, "scene": options.scene, **asdict(setting),

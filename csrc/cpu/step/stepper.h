@@ -88,9 +88,10 @@ class Stepper {
     if (plan_.components == 0 || (first && set_.start() == StartKind::given)) return;
     if (first) return choose_first_iterate();
     if constexpr (HasContacts) {
-      each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force, Wide(1.0)); });
+      each_elastic_force(
+          [&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force, Wide(1.0)); });
     }
-    correct();
+    correct([](const auto&...) {});
   }
 
   // The guess that the first iterate is made from.
@@ -159,13 +160,16 @@ class Stepper {
   void keep_forces(std::int64_t i, const Vec3<Wide>& elastic, const Wide& inertial) {
     const CoarseVertex<Wide> v = coarse_vertex(w_, i);
     const Vec3<Wide> offset = v.u - widened<Wide>(Lanes::vec3(w_.target[i]));
-    const Vec3<Wide> gradient = multiply_add(inertial * Lanes::widen(w_.inertia[i]), offset, elastic);
+    const Vec3<Wide> gradient =
+        multiply_add(inertial * Lanes::widen(w_.inertia[i]), offset, elastic);
     const Vec3<Wide> free = subtract_product(v.u, Lanes::widen(w_.inverse[i]), gradient);
     pd::keep_forces(contacts_, v, free, forces_of(i));
   }
 
-  // Moves every body by its rigid motion with the least energy, and then each vertex by what the contacts still push.
-  void correct() {
+  // Moves every body by its rigid motion with the least energy, and then each vertex by what the contacts still push:
+  // pushed(vertex, displacement before, displacement after).
+  template <class Pushed>
+  void correct(const Pushed& pushed) {
     if (team_.rank == 0) find_motions<HasContacts>(plan_, w_, contacts_);
     team_.barrier();
     each_that_moves([&](std::int64_t i) {
@@ -177,9 +181,9 @@ class Stepper {
       Value u = vertex(i).displaced(w_.u[i], narrowed(way));
       if constexpr (HasContacts) {
         v.u = widened<Wide>(Lanes::vec3(u));
-        u = vertex(i).displaced(
-            u, narrowed(push_of(contacts_, v, forces_of(i))));
+        u = vertex(i).displaced(u, narrowed(push_of(contacts_, v, forces_of(i))));
         u = vertex(i).project(contacts_, u, u);
+        pushed(i, v.u, widened<Wide>(Lanes::vec3(u)));
       }
       const Wide moves = w_.body_sums[plan_.vertex_component[i]].moves;
       w_.u[i] = select(Lanes::narrow(moves) > Real(T(0)), u, w_.u[i]);
@@ -188,11 +192,14 @@ class Stepper {
   }
 
   Value present_iterate(std::int64_t i) const { return vertex(i).current_iterate(contacts_); }
-  Value guessed_iterate(std::int64_t i) const { return vertex(i).first_iterate(contacts_, guess(i)); }
+  Value guessed_iterate(std::int64_t i) const {
+    return vertex(i).first_iterate(contacts_, guess(i));
+  }
 
   // The present shape and the guess are both corrected, and the one with the lower energy stays: Phi less |f0|^2 / (2 D). Elastic
   // energies differ by the work of the mean elastic force, which rigid motions do not change. For the present shape, contacts answer
-  // the elastic forces alone.
+  // the elastic forces alone. Phi has no work of the pushes on the inertia that f0 does not answer: all of it there, what the
+  // correction has changed at the guess.
   void choose_first_iterate() {
     const auto add_work = [&](std::int64_t i, const Vec3<Wide>& force, double side) {
       const Vec3<Wide> way = widened<Wide>(Lanes::vec3(guessed_iterate(i))) -
@@ -200,8 +207,15 @@ class Stepper {
       Wide work = Wide(0.5) * dot(force, way);
       if constexpr (HasContacts) {
         keep_forces(i, force, Wide(side > 0 ? 0.0 : 1.0));
-        work = multiply_add(Wide(side), anchor_energy(contacts_, coarse_vertex(w_, i), forces_of(i)), work);
+        work = multiply_add(Wide(side),
+                            anchor_energy(contacts_, coarse_vertex(w_, i), forces_of(i)), work);
       }
+      w_.work[i] = w_.work[i] + Lanes::narrow(work);
+    };
+    const auto add_pushed = [&](std::int64_t i, const auto& before, const auto& after,
+                                const Value& answered, double side) {
+      const Vec3<Wide> offset = before - widened<Wide>(Lanes::vec3(answered));
+      const Wide work = (Wide(side) * Lanes::widen(w_.inertia[i])) * dot(offset, after - before);
       w_.work[i] = w_.work[i] + Lanes::narrow(work);
     };
     each_that_moves([&](std::int64_t i) {
@@ -210,7 +224,9 @@ class Stepper {
     });
     team_.barrier();
     each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, 1.0); });
-    correct();
+    correct([&](std::int64_t i, const auto& before, const auto& after) {
+      add_pushed(i, before, after, w_.target[i], -1.0);
+    });
     if (team_.rank == 0) {
       for (int n = 0; n < plan_.components * width; ++n) w_.reached[n] = w_.bodies[n].reached();
     }
@@ -220,12 +236,15 @@ class Stepper {
     });
     team_.barrier();
     each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, -1.0); });
-    correct();
+    correct([&](std::int64_t i, const auto& before, const auto& after) {
+      add_pushed(i, before, after, guessed_iterate(i), 1.0);
+    });
     if (team_.rank == 0) sum_rises();
     team_.barrier();
     each_that_moves([&](std::int64_t i) {
       const BodySums<Wide>& body = w_.body_sums[plan_.vertex_component[i]];
-      const auto stays = Lanes::narrow(body.moves) > Real(T(0)) && !(Lanes::narrow(body.rise) < Real(T(0)));
+      const auto stays =
+          Lanes::narrow(body.moves) > Real(T(0)) && !(Lanes::narrow(body.rise) < Real(T(0)));
       w_.u[i] = w_.before[i] = select(stays, w_.before[i], w_.u[i]);
     });
     team_.barrier();

@@ -4,7 +4,7 @@
 
 namespace pd::inline PD_TARGET {
 
-// V 2 mu and V lambda of one tetrahedron of a pair.
+// V 2 mu and V lambda of one tetrahedron of a pair; of a diagonal the weight twice, see PairPressure.
 template <class Side, class T, class Numbers>
 PD_DEVICE void compute_group_weights(const DevicePlan<T>& plan, const Numbers& numbers,
                                      PairPlace place, const Moduli<T>& moduli, WeightKind kind,
@@ -20,7 +20,7 @@ PD_DEVICE void compute_group_weights(const DevicePlan<T>& plan, const Numbers& n
                        plan.pair_coupled[place.in(1)] != 0 && kind == WeightKind::force;
   const T weight = volume * lame.of(kind, absolute(bound));
   weights[to] = coupled ? -weight : weight;
-  weights[to + 2 * pair_lanes] = volume * lame.lambda;
+  weights[to + 2 * pair_lanes] = kind == WeightKind::force ? volume * lame.lambda : weight;
 }
 
 // w V of both tetrahedra of a pair, times l_e for the majoriser.

@@ -101,7 +101,8 @@ PD_DEVICE PairPlace place_of(const Patch<T>& patch, int pair) {
   return {unsigned(patch.first_block) * pair_lanes + unsigned(pair)};
 }
 
-// V lambda of both tetrahedra; nothing without Poisson's ratio.
+// V lambda of both tetrahedra; nothing without Poisson's ratio. A diagonal reads no V lambda: its weights repeat the
+// weight there, with its sign.
 template <class T, bool There = has_poisson_ratio>
 struct PairPressure {};
 template <class T>
@@ -115,6 +116,12 @@ template <class T>
 struct PairInputs : PairPressure<T> {
   unsigned corner[5];
   T weight[2];
+
+  // of tetrahedron e, for elements that read weights alone
+  PD_HD const T& signed_weight(int e) const {
+    if constexpr (has_poisson_ratio) return this->pressure[e];
+    return weight[e];
+  }
 
   PD_HD int slot(int c) const { return int(corner[c] & 0xffff) / 8; }
   PD_HD int entry(int c) const { return int(corner[c] >> 16); }
@@ -381,10 +388,10 @@ PD_DEVICE void process_pair(const Read& read, const Shape& shape, const PairInpu
   } else if constexpr (OnFaces<Element>) {
     element.run_face(pair.corner[0], shape.face, numbers.weight, pair.force, energy);
   } else {
-    element.template run<1>(
-        PairElement<T, Fields, First>{pair, shape.face.inverse(0), numbers.weight[0], energy});
-    element.template run<1>(
-        PairElement<T, Fields, Second>{pair, shape.face.inverse(1), numbers.weight[1], energy});
+    element.template run<1>(PairElement<T, Fields, First>{pair, shape.face.inverse(0),
+                                                          numbers.signed_weight(0), energy});
+    element.template run<1>(PairElement<T, Fields, Second>{pair, shape.face.inverse(1),
+                                                           numbers.signed_weight(1), energy});
   }
   for (int c = 0; c < 4; ++c) write_entry(pair.force[c], entries[numbers.entry(c)]);
   if (numbers.entry(4) != no_entry) write_entry(pair.force[4], entries[numbers.entry(4)]);

@@ -2,7 +2,8 @@
 //
 //   force on v = sum_u t_vu (x_u - x_v),   E = -1/4 sum_v sum_u t_vu |x_u - x_v|^2
 //
-// t has both signs, so the energy is summed in float64: that of a smooth surface is small against its terms.
+// t has both signs, so the energy of a smooth surface is small against its terms. Differences and sums of the energy are
+// float64: the rounding of x_u - x_v in float32 would change it by more than the slack of the guard.
 #pragma once
 #include "cuda/elements/stencils.h"
 
@@ -49,11 +50,13 @@ PD_DEVICE Vec3<T> value_of_row(const StencilGradient<Energy>&, const Rows<T>& ro
   for (int line = rows.plan.row_start[block]; line < end; ++line) {
     const auto both = unsigned(rows.plan.row_neighbour[line * row_lanes + int(threadIdx.x) % 32]);
     const RowPair<T> t = rows.pair(line);
-    const Vec3<T> one = at(both & 0xffff) - own, two = at(both >> 16) - own;
-    force = multiply_add(t.second, two, multiply_add(t.first, one, force));
+    const Vec3<T> one = at(both & 0xffff), two = at(both >> 16);
+    force = multiply_add(t.second, two - own, multiply_add(t.first, one - own, force));
     if constexpr (Energy) {
-      const auto square = [](const Vec3<T>& d) {
-        return double(d.x) * double(d.x) + double(d.y) * double(d.y) + double(d.z) * double(d.z);
+      const auto square = [&own](const Vec3<T>& x) {
+        const double d[3] = {double(x.x) - double(own.x), double(x.y) - double(own.y),
+                             double(x.z) - double(own.z)};
+        return d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
       };
       energy -= 0.25 * (double(t.first) * square(one) + double(t.second) * square(two));
     }

@@ -13,7 +13,7 @@ template <class T, bool There = has_poisson_ratio>
 struct TetPressure {};
 template <class T>
 struct TetPressure<T, true> {
-  T pressure;    // V lambda
+  T pressure;    // V lambda; of a diagonal as in PairPressure
   bool coupled;  // whether its pair averages with a neighbour
 };
 
@@ -21,6 +21,12 @@ template <class T>
 struct TetInputs : TetPressure<T> {
   unsigned corner[4];  // 8 times the slot, plus 65536 times the entry
   T weight, factor;    // w V; pair_factor where rest shapes are computed
+
+  // for elements that read weights alone
+  PD_HD const T& signed_weight() const {
+    if constexpr (has_poisson_ratio) return this->pressure;
+    return weight;
+  }
 
   PD_HD unsigned slot_times_8(int c) const { return corner[c] & 0xffff; }
 };
@@ -138,7 +144,7 @@ PD_DEVICE T each_tet(const Patch<T>& patch, const Slots& slots, const ShapeOf& s
     } else if constexpr (OnFaces<Element>) {
       element.run_face(x, rest, {now.weight}, force, tet_energy);
     } else {
-      element.template run<1>(TetElement<T>{rest.inverse(0), now.weight, force});
+      element.template run<1>(TetElement<T>{rest.inverse(0), now.signed_weight(), force});
     }
     for (int c = 0; c < 3; ++c) force[c] = add_partner(force[c]);
     const bool here = first + lane < all, second = lane & 1;

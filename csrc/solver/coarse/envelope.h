@@ -183,13 +183,13 @@ PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
   return push;
 }
 
-// What a round asks of a body's vertices: displacements `before` and `after`, and the arms after. `renews`: radii move
-// half way to friction l. All per environment.
+// What a round asks of a body's vertices, per environment: the accepted motion and the trial, a finite motion, or to first
+// order a twist about the moved centre. `renews`: the share by which radii move toward friction l.
 template <class W>
 struct CoarseTrial {
-  Mat3<W> turn_before, turn_after;  // R - I
+  Mat3<W> turn_before, turn_after;  // R - I; to first order [w]x R
   Vec3<W> center, shift_before, shift_after;
-  W renews;  // 0.5, or 0
+  W finite, renews;  // 1 or 0; 0.5 or 0
 };
 
 // Adds the contacts of a vertex. `forces[n stride]`: ContactForce of contact n.
@@ -197,19 +197,24 @@ template <class R, class W, class Forces>
 PD_HD void add_contacts(W (&sum)[ContactSums::count], const Contacts<R>& contacts,
                         const CoarseVertex<W>& v, const CoarseTrial<W>& trial, const Forces& forces) {
   using S = ContactSums;
-  const Vec3<W> arm = (v.x + v.u) - trial.center;
-  const Vec3<W> first = v.u + (trial.turn_before * arm + trial.shift_before);
+  const Vec3<W> arm = (v.x + v.u) - trial.center, turned = trial.turn_before * arm;
+  const Vec3<W> first = v.u + (turned + trial.shift_before);
   const Vec3<W> way = trial.turn_after * arm, then = v.u + (way + trial.shift_after);
   const W none(0.0), free = select(v.stiffness > none, W(1.0), none);
   const W stiffness = select(v.stiffness > none, v.stiffness, W(1.0));
+  const auto finite = trial.finite > none;
+  const Vec3<W> lever = arm + select(finite, way, turned);
   each_contact<W>(contacts, [&](int n, const auto& shape) {
-    const Surface<W> before = surface_at(shape, v.x, first), after = surface_at(shape, v.x, then);
+    const Surface<W> before = surface_at(shape, v.x, first);
+    Surface<W> after = surface_at(shape, v.x, then);
     const W friction = shape.friction;
-    const Vec3<W> force = forces.force(n);
+    const Vec3<W> force = forces.force(n), moved = then - first;
     W radius = forces.radius(n);
     // by the normal of before, so that both energies are of one function
     const Envelope<W> old(stiffness, force, before.normal);
-    const Surface<W> there = {before.normal, after.gap, before.slip + tangential(then - first, before.normal)};
+    const Surface<W> there = {before.normal, select(finite, after.gap, before.gap + dot(before.normal, moved)),
+                              before.slip + tangential(moved, before.normal)};
+    after = {select(finite, after.normal, there.normal), there.gap, select(finite, after.slip, there.slip)};
     const Envelope<W> now(stiffness, force, after.normal);
     const W normal = now.normal_force(after.gap);
     if (!any(((old.normal_force(before.gap) + normal) + radius) + dot(force, force) > none)) return;
@@ -224,7 +229,7 @@ PD_HD void add_contacts(W (&sum)[ContactSums::count], const Contacts<R>& contact
     const W across = free * (rub.share * stiffness);
     const W along = select(normal > none, free * stiffness, none);
     const Vec3<W> pull = free * multiply_add(normal, after.normal, rub.share * rub.pull);
-    add_twist_terms(sum, arm + way, after.normal, pull, across, along);
+    add_twist_terms(sum, lever, after.normal, pull, across, along);
   });
 }
 

@@ -1,9 +1,9 @@
-// Newton's method for the rigid motion of a body with the least energy Phi: its quadratics (solver/coarse/sums.h) and the
-// envelopes of its contacts (solver/coarse/envelope.h).
+// The rigid motion of a body with the least energy Phi: its quadratics (solver/coarse/sums.h) and the envelopes of its contacts
+// (solver/coarse/envelope.h).
 //
-// A pass takes the contact sums of a trial. If Phi has not risen the trial is accepted, and the twist of Newton's step leads to
-// the next one. Else the step ends where the quadratic model of Phi at the trial is least along it. Radii of friction move half way to friction times l in every pass that begins near
-// enough. Finite motions are kept as a turn about the moving centre and a shift, so that vertices are moved once, at the end.
+// Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each ended
+// where Phi is least along it, and radii of friction that move half way to friction times l near the minimum. The motion is halved
+// until Phi itself has not risen. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
 #include "solver/coarse/sums.h"
@@ -19,11 +19,13 @@ struct RigidMotion {
   PD_HD Vec3<T> of(const Vec3<T>& y) const { return turn * (y - center) + shift; }
 };
 
-constexpr int most_passes = 32, most_cuts = 8;
-// Shares of the size of a body, and of a radius: a motion that ends the passes, and one within which radii are renewed.
+constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 30;
+// Shares of the size of a body, and of a radius: a step that ends the passes, and one within which radii are renewed.
 constexpr double still_share = 1e-6, near_share = 1e-3;
 // Of the energy that moves a body by its size: a rise that is rounding.
 constexpr double energy_rounding = 1e-14;
+// Of the slope of Phi where a step begins: none.
+constexpr double no_slope = 1e-9;
 // Of the largest pivot: no inertia, such as that of a line about itself.
 constexpr double no_pivot = 1e-12;
 
@@ -37,7 +39,8 @@ PD_HD Mat3<double> small_turn(const Vec3<double>& v) {
 }
 
 PD_HD bool is_positive(const Mat3<double>& a) {
-  return a.row[0].x > 0 && difference_of_products(a.row[0].x, a.row[1].y, a.row[0].y, a.row[1].x) > 0 &&
+  return a.row[0].x > 0 &&
+         difference_of_products(a.row[0].x, a.row[1].y, a.row[0].y, a.row[1].x) > 0 &&
          determinant(a) > 0;
 }
 
@@ -83,7 +86,13 @@ class CoarseBody {
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
-    return {accepted_.turn, trial_.turn, body_.center, accepted_.shift, trial_.shift, renews() ? 0.5 : 0.0};
+    return {accepted_.turn,
+            trial_.turn,
+            body_.center,
+            accepted_.shift,
+            trial_.shift,
+            finite_ ? 1.0 : 0.0,
+            !finite_ && way_ > 0 && way_ <= near_share * size_ ? 0.5 : 0.0};
   }
 
   // All passes of a body without contacts.
@@ -93,21 +102,11 @@ class CoarseBody {
   }
 
   PD_COLD void pass(const double (&sum)[ContactSums::count]) {
-    using S = ContactSums;
-    const double before = energy(accepted_) + sum[S::before], after = energy(trial_) + sum[S::after];
-    const double rounding = energy_rounding * (body_.weight * body_.square + sum[S::before]);
-    if (after <= before + rounding) {
-      accepted_ = trial_;
-      contact_energy_ = sum[S::after];
-      cuts_ = 0;
-      const bool settled = sum[S::lag] <= still_share * still_share * sum[S::radius];
-      done_ = (passes_ > 0 && way_ <= still_share * size_ && settled) || ++passes_ > most_passes;
-      if (!done_) find_step(sum);
+    if (finite_) {
+      end_motion(sum);
     } else {
-      done_ = ++cuts_ > most_cuts;
-      shorten(sum);
+      go_on(sum);
     }
-    if (!done_) take_step();
   }
 
  private:
@@ -117,8 +116,94 @@ class CoarseBody {
            frobenius(motion.turn, body_.covariance);
   }
 
-  // whether the trial is near enough to the last one
-  PD_HD bool renews() const { return passes_ > 0 && way_ <= near_share * size_; }
+  // After the pass of a finite motion: accepts it, or halves its twist.
+  PD_HD void end_motion(const double (&sum)[ContactSums::count]) {
+    using S = ContactSums;
+    const double before = energy(accepted_) + sum[S::before],
+                 after = energy(trial_) + sum[S::after];
+    if (!(after <= before + energy_rounding * (body_.weight * body_.square + sum[S::before]))) {
+      done_ = ++cuts_ > most_cuts;
+      for (double& number : twist_) number *= 0.5;
+      if (!done_) try_motion();
+      return;
+    }
+    accepted_ = trial_;
+    contact_energy_ = sum[S::after];
+    cuts_ = 0;
+    done_ = (motions_ > 0 && length_of(twist_) <= still_share * size_) || ++motions_ > most_motions;
+    if (done_) return;
+    find_quadratics();
+    for (double& number : twist_) number = 0;
+    steps_ = 0;
+    finite_ = false;
+    begin_step(sum);
+  }
+
+  // After a pass to first order: ends the step, or goes on to where Phi is least along it.
+  PD_HD void go_on(const double (&sum)[ContactSums::count]) {
+    using S = ContactSums;
+    double at[6], force[6], matrix[21], slope = 0, second = 0;
+    for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
+    find_terms(at, sum, force, matrix);
+    for (int i = 0; i < 6; ++i) {
+      slope -= force[i] * step_[i];
+      for (int j = 0; j <= i; ++j)
+        second += (i == j ? 1.0 : 2.0) * step_[i] * step_[j] * matrix[i * (i + 1) / 2 + j];
+    }
+    const bool ends =
+        share_ == 1.0 ? slope <= no_slope * slope_ : absolute(slope) <= no_slope * slope_;
+    if (!ends && ++searches_ <= most_searches) {
+      (slope < 0 ? low_ : high_) = share_;
+      // the slope rises: Newton's step within the bracket, or its middle
+      const double next = share_ - slope / second;
+      share_ = low_ < next && next < high_ ? next : 0.5 * (low_ + high_);
+      return try_step();
+    }
+    for (int i = 0; i < 6; ++i) twist_[i] = at[i];
+    const bool settled = sum[S::lag] <= still_share * still_share * sum[S::radius];
+    if ((way_ <= still_share * size_ && settled) || ++steps_ >= most_steps) return try_motion();
+    begin_step(sum);
+  }
+
+  PD_HD void begin_step(const double (&sum)[ContactSums::count]) {
+    double matrix[21], force[6];
+    find_terms(twist_, sum, force, matrix);
+    for (int i = 0; i < 6; ++i) step_[i] = force[i];
+    solve_6x6(matrix, step_);
+    slope_ = 0;
+    for (int i = 0; i < 6; ++i) slope_ += force[i] * step_[i];
+    searches_ = 0;
+    low_ = 0, high_ = share_ = 1;
+    try_step();
+  }
+
+  PD_HD static double length_of(const double (&twist)[6]) {
+    return square_root(twist[0] * twist[0] + twist[1] * twist[1] + twist[2] * twist[2]) +
+           square_root(twist[3] * twist[3] + twist[4] * twist[4] + twist[5] * twist[5]);
+  }
+
+  // The trial to first order: the twist and the step.
+  PD_HD void try_step() {
+    way_ = share_ * length_of(step_);
+    double at[6];
+    for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
+    const Vec3<double> shift = {at[0], at[1], at[2]}, turn = {at[3], at[4], at[5]};
+    const Mat3<double> more = cross_matrix(length_ * turn), product = more * accepted_.turn;
+    trial_.shift = accepted_.shift + shift;
+    for (int r = 0; r < 3; ++r)
+      trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
+  }
+
+  // The finite trial.
+  PD_HD void try_motion() {
+    finite_ = true;
+    const Vec3<double> shift = {twist_[0], twist_[1], twist_[2]},
+                       turn = {twist_[3], twist_[4], twist_[5]};
+    const Mat3<double> more = small_turn(length_ * turn), product = more * accepted_.turn;
+    trial_.shift = accepted_.shift + shift;
+    for (int r = 0; r < 3; ++r)
+      trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
+  }
 
   // R A
   PD_HD static Mat3<double> turned(const RigidMotion<double>& motion, const Mat3<double>& a) {
@@ -127,53 +212,42 @@ class CoarseBody {
     return product;
   }
 
-  // Minus the first derivative of Phi at a motion, and the second, by its lower triangle. In lengths: turns times the size.
-  PD_HD void find_terms(const RigidMotion<double>& at, const double (&sum)[ContactSums::count],
-                        double (&step)[6], double (&matrix)[21]) const {
-    using S = ContactSums;
+  // Of the quadratics at the accepted motion: minus the first derivative, and the second. In lengths: turns times the size.
+  PD_HD void find_quadratics() {
     // sum a (r + d) r^T and sum a r r^T, with the arms and ways of now
-    const Mat3<double> covariance = transpose(turned(at, transpose(body_.covariance)));
-    Mat3<double> second = axis_matrix(covariance);
-    if (!is_positive(second)) {
-      const Mat3<double> half = turned(at, body_.second_moment);
-      second = axis_matrix(transpose(turned(at, transpose(half))));
+    const Mat3<double> covariance = transpose(turned(accepted_, transpose(body_.covariance)));
+    second_ = axis_matrix(covariance);
+    if (!is_positive(second_)) {
+      const Mat3<double> half = turned(accepted_, body_.second_moment);
+      second_ = axis_matrix(transpose(turned(accepted_, transpose(half))));
     }
-    const Vec3<double> force = subtract_product(body_.pull, body_.weight, at.shift),
-                       moment = axis_of(covariance);
-    const double own[6] = {force.x, force.y, force.z, moment.x, moment.y, moment.z};
-    for (int n = 0; n < 21; ++n) matrix[n] = sum[S::matrix + n];
-    const double rows[3][3] = {{second.row[0].x, second.row[0].y, second.row[0].z},
-                               {second.row[1].x, second.row[1].y, second.row[1].z},
-                               {second.row[2].x, second.row[2].y, second.row[2].z}};
+    second_ = (length_ * length_) * second_;
+    force_ = subtract_product(body_.pull, body_.weight, accepted_.shift);
+    moment_ = length_ * axis_of(covariance);
+  }
+
+  // Minus the first derivative of Phi to first order at a twist, and the second, by its lower triangle.
+  PD_HD void find_terms(const double (&at)[6], const double (&sum)[ContactSums::count],
+                        double (&force)[6], double (&matrix)[21]) const {
+    using S = ContactSums;
+    const Vec3<double> shift = {at[0], at[1], at[2]}, turn = {at[3], at[4], at[5]};
+    const Vec3<double> f = subtract_product(force_, body_.weight, shift),
+                       m = moment_ - second_ * turn;
+    const double own[6] = {f.x, f.y, f.z, m.x, m.y, m.z};
+    const double rows[3][3] = {{second_.row[0].x, second_.row[0].y, second_.row[0].z},
+                               {second_.row[1].x, second_.row[1].y, second_.row[1].z},
+                               {second_.row[2].x, second_.row[2].y, second_.row[2].z}};
     for (int i = 0; i < 6; ++i) {
       const double scale = i < 3 ? 1.0 : length_;
-      step[i] = scale * (own[i] + sum[S::force + i]);
-      for (int j = 0; j <= i; ++j) {
-        double& number = matrix[S::at(i, j) - S::matrix];
-        number += i < 3 ? (i == j ? body_.weight : 0.0) : j < 3 ? 0.0 : rows[i - 3][j - 3];
-        number *= scale * (j < 3 ? 1.0 : length_);
-      }
-    }
-    if (body_.hold != Hold::none) keep_to_pins(matrix, step);
-  }
-
-  PD_HD void find_step(const double (&sum)[ContactSums::count]) {
-    double matrix[21];
-    find_terms(accepted_, sum, step_, matrix);
-    solve_6x6(matrix, step_);
-  }
-
-  // Ends the step where the quadratic model of Phi at the trial is least along it, or half way.
-  PD_HD void shorten(const double (&sum)[ContactSums::count]) {
-    double force[6], matrix[21], slope = 0, second = 0;
-    find_terms(trial_, sum, force, matrix);
-    for (int i = 0; i < 6; ++i) {
-      slope -= force[i] * step_[i];
+      force[i] = multiply_add(scale, sum[S::force + i], own[i]);
       for (int j = 0; j <= i; ++j)
-        second += (i == j ? 1.0 : 2.0) * step_[i] * step_[j] * matrix[i * (i + 1) / 2 + j];
+        matrix[i * (i + 1) / 2 + j] =
+            multiply_add(scale * (j < 3 ? 1.0 : length_), sum[S::at(i, j)],
+                         i < 3   ? (i == j ? body_.weight : 0.0)
+                         : j < 3 ? 0.0
+                                 : rows[i - 3][j - 3]);
     }
-    const double back = slope / second, share = back > 0 && back < 1 ? 1.0 - back : 0.5;
-    for (double& number : step_) number *= share;
+    if (body_.hold != Hold::none) keep_to_pins(matrix, force);
   }
 
   // Pins leave no shift; along a line they leave the turn about it.
@@ -188,7 +262,8 @@ class CoarseBody {
     double along = 0, force = 0;
     for (int i = 0; i < 3; ++i) {
       force += n[i] * step[3 + i];
-      for (int j = 0; j < 3; ++j) along += n[i] * n[j] * (i > j ? entry(3 + i, 3 + j) : entry(3 + j, 3 + i));
+      for (int j = 0; j < 3; ++j)
+        along += n[i] * n[j] * (i > j ? entry(3 + i, 3 + j) : entry(3 + j, 3 + i));
     }
     for (int i = 0; i < 3; ++i) {
       step[3 + i] = force * n[i];
@@ -196,20 +271,15 @@ class CoarseBody {
     }
   }
 
-  PD_HD void take_step() {
-    const Vec3<double> shift = {step_[0], step_[1], step_[2]}, turn = {step_[3], step_[4], step_[5]};
-    way_ = square_root(dot(shift, shift)) + square_root(dot(turn, turn));
-    const Mat3<double> more = small_turn(length_ * turn), product = more * accepted_.turn;
-    trial_.shift = accepted_.shift + shift;
-    for (int r = 0; r < 3; ++r)
-      trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
-  }
-
   RigidBody body_;
   RigidMotion<double> accepted_, trial_;
-  double size_, length_, step_[6], way_ = 0, contact_energy_ = 0;  // length_: 1 / size_
-  int passes_ = 0, cuts_ = 0;
-  bool done_ = true;
+  Mat3<double> second_;
+  Vec3<double> force_, moment_;
+  double size_, length_;  // length_: 1 / size_
+  double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
+  double way_ = 0, slope_ = 0, contact_energy_ = 0;
+  int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
+  bool finite_ = true, done_ = true;
 };
 
 }  // namespace pd::inline PD_TARGET
