@@ -49,13 +49,15 @@ struct VertexForces {
   Vec3<Wide> force(int n) const {
     return widened<Wide>(Lanes::vec3(w.contact_force[std::int64_t(n) * vertices + i]));
   }
-  Wide radius(int n) const { return Lanes::widen(w.friction_radius[std::int64_t(n) * vertices + i]); }
+  Wide radius(int n) const {
+    return Lanes::widen(w.friction_radius[std::int64_t(n) * vertices + i]);
+  }
   void set_radius(int n, const Wide& radius) const {
     w.friction_radius[std::int64_t(n) * vertices + i] = Lanes::narrow(radius);
   }
   void set(int n, const Vec3<Wide>& force, const Wide& radius) const {
-    w.contact_force[std::int64_t(n) * vertices + i] = Lanes::value(
-        {Lanes::narrow(force.x), Lanes::narrow(force.y), Lanes::narrow(force.z)});
+    w.contact_force[std::int64_t(n) * vertices + i] =
+        Lanes::value({Lanes::narrow(force.x), Lanes::narrow(force.y), Lanes::narrow(force.z)});
     set_radius(n, radius);
   }
 };

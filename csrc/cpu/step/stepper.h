@@ -91,7 +91,7 @@ class Stepper {
       each_elastic_force(
           [&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force, Wide(1.0)); });
     }
-    correct([](const auto&...) {});
+    correct();
   }
 
   // The guess that the first iterate is made from.
@@ -166,10 +166,8 @@ class Stepper {
     pd::keep_forces(contacts_, v, free, forces_of(i));
   }
 
-  // Moves every body by its rigid motion with the least energy, and then each vertex by what the contacts still push:
-  // pushed(vertex, displacement before, displacement after).
-  template <class Pushed>
-  void correct(const Pushed& pushed) {
+  // Moves every body by its rigid motion with the least energy, and then each vertex by what the contacts still push.
+  void correct() {
     if (team_.rank == 0) find_motions<HasContacts>(plan_, w_, contacts_);
     team_.barrier();
     each_that_moves([&](std::int64_t i) {
@@ -183,7 +181,6 @@ class Stepper {
         v.u = widened<Wide>(Lanes::vec3(u));
         u = vertex(i).displaced(u, narrowed(push_of(contacts_, v, forces_of(i))));
         u = vertex(i).project(contacts_, u, u);
-        pushed(i, v.u, widened<Wide>(Lanes::vec3(u)));
       }
       const Wide moves = w_.body_sums[plan_.vertex_component[i]].moves;
       w_.u[i] = select(Lanes::narrow(moves) > Real(T(0)), u, w_.u[i]);
@@ -196,10 +193,8 @@ class Stepper {
     return vertex(i).first_iterate(contacts_, guess(i));
   }
 
-  // The present shape and the guess are both corrected, and the one with the lower energy stays: Phi less |f0|^2 / (2 D). Elastic
-  // energies differ by the work of the mean elastic force, which rigid motions do not change. For the present shape, contacts answer
-  // the elastic forces alone. Phi has no work of the pushes on the inertia that f0 does not answer: all of it there, what the
-  // correction has changed at the guess.
+  // The present shape and the guess are both corrected, and the one with the lower energy stays (rise_of). For the present
+  // shape, contacts answer the elastic forces alone.
   void choose_first_iterate() {
     const auto add_work = [&](std::int64_t i, const Vec3<Wide>& force, double side) {
       const Vec3<Wide> way = widened<Wide>(Lanes::vec3(guessed_iterate(i))) -
@@ -212,23 +207,16 @@ class Stepper {
       }
       w_.work[i] = w_.work[i] + Lanes::narrow(work);
     };
-    const auto add_pushed = [&](std::int64_t i, const auto& before, const auto& after,
-                                const Value& answered, double side) {
-      const Vec3<Wide> offset = before - widened<Wide>(Lanes::vec3(answered));
-      const Wide work = (Wide(side) * Lanes::widen(w_.inertia[i])) * dot(offset, after - before);
-      w_.work[i] = w_.work[i] + Lanes::narrow(work);
-    };
     each_that_moves([&](std::int64_t i) {
       w_.u[i] = present_iterate(i);
       w_.work[i] = Real(T(0));
     });
     team_.barrier();
     each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, 1.0); });
-    correct([&](std::int64_t i, const auto& before, const auto& after) {
-      add_pushed(i, before, after, w_.target[i], -1.0);
-    });
+    correct();
     if (team_.rank == 0) {
       for (int n = 0; n < plan_.components * width; ++n) w_.reached[n] = w_.bodies[n].reached();
+      for (int g = 0; g < plan_.components; ++g) w_.motion_before[g] = w_.motion[g];
     }
     each_that_moves([&](std::int64_t i) {
       w_.before[i] = w_.u[i];
@@ -236,9 +224,7 @@ class Stepper {
     });
     team_.barrier();
     each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, -1.0); });
-    correct([&](std::int64_t i, const auto& before, const auto& after) {
-      add_pushed(i, before, after, guessed_iterate(i), 1.0);
-    });
+    correct();
     if (team_.rank == 0) sum_rises();
     team_.barrier();
     each_that_moves([&](std::int64_t i) {
@@ -259,12 +245,17 @@ class Stepper {
       }
     }
     each_in_a_body<Lanes>(plan_, [&](int i, int g) {
-      const Vec3<Wide> target = widened<Wide>(Lanes::vec3(w_.target[i]));
-      const Vec3<Wide> after = widened<Wide>(Lanes::vec3(guessed_iterate(i))) - target,
-                       before = widened<Wide>(Lanes::vec3(present_iterate(i))) - target;
-      const Wide inertia = Lanes::widen(w_.inertia[i]) * (dot(after, after) - dot(before, before));
+      const auto candidate = [&](const Value& first, const Value& last,
+                                 const RigidMotion<Wide>& motion) {
+        return Candidate<Wide>{widened<Wide>(Lanes::vec3(first)), widened<Wide>(Lanes::vec3(last)),
+                               motion};
+      };
+      const Candidate<Wide> kept = candidate(present_iterate(i), w_.before[i], w_.motion_before[g]),
+                            moved = candidate(guessed_iterate(i), w_.u[i], w_.motion[g]);
       Wide& rise = w_.body_sums[g].rise;
-      rise = rise + multiply_add(Wide(0.5), inertia, Lanes::widen(w_.work[i]));
+      rise = (rise + Lanes::widen(w_.work[i])) +
+             rise_of<HasContacts>(Lanes::widen(w_.inertia[i]), widened<Wide>(Lanes::vec3(w_.x[i])),
+                                  widened<Wide>(Lanes::vec3(w_.target[i])), kept, moved);
     });
   }
 

@@ -51,13 +51,14 @@ struct Workspace {
   Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
   Value *origin, *shared_force;                       // [slots]
   Part* parts[2];  // iterations alternate, so that no thread overwrites sums that others read
-  BodySums<Wide>* body_sums;   // [components]
-  CoarseBody* bodies;          // [components, environments]
-  CoarseTrial<Wide>* trial;    // [components]
-  RigidMotion<Wide>* motion;   // [components]
-  double* reached;             // [components, environments] Phi of the first of both first iterates
-  Real* work;                  // [vertices] of the mean elastic force, from the first to the second
-  Value* contact_force;        // [contacts, vertices], like the next
+  BodySums<Wide>* body_sums;         // [components]
+  CoarseBody* bodies;                // [components, environments]
+  CoarseTrial<Wide>* trial;          // [components]
+  RigidMotion<Wide>* motion;         // [components]
+  RigidMotion<Wide>* motion_before;  // [components] of the first of both first iterates
+  double* reached;       // [components, environments] Phi of the first of both first iterates
+  Real* work;            // [vertices] of the mean elastic force, from the first to the second
+  Value* contact_force;  // [contacts, vertices], like the next
   Real* friction_radius;
   Plane<Real>* planes;
   Sphere<Real>* spheres;
@@ -67,7 +68,7 @@ struct Workspace {
   T* numbers;  // the same of stencils: [rows of 16 numbers of a step]
   int part_count;
   bool shared_weight, shared_numbers;
-  T per_time;               // 1 / h of the step, or 0 where energies that dissipate do not count
+  T per_time;  // 1 / h of the step, or 0 where energies that dissipate do not count
 
   explicit Workspace(const StepCall<T>& call)
       : Workspace(call.plan, call.material, call.effects,
@@ -132,6 +133,7 @@ struct Workspace {
     place(body_sums, plan.components, base);
     place(bodies, plan.components * Lanes::environments, base);
     place(motion, plan.components, base);
+    place(motion_before, plan.components, base);
     place(reached, plan.components * Lanes::environments, base);
     place(work, plan.components > 0 ? plan.vertices : 0, base);
     const std::int64_t contacts =

@@ -282,4 +282,31 @@ class CoarseBody {
   bool finite_ = true, done_ = true;
 };
 
+// One of the two first iterates of a step, at a vertex: its displacement before and after the correction, and the motion of
+// its body.
+template <class W>
+struct Candidate {
+  Vec3<W> first, last;
+  RigidMotion<W> motion;
+};
+
+// What a vertex adds to the rise of energy from the corrected present shape, `kept`, to the corrected guess, `moved`; besides
+// the rise of Phi, and the work of the mean elastic force and the anchors' energies, which are known before. Inertia before
+// the corrections, which Phi lacks; and the work of the pushes on the inertia that the anchors do not answer: all of it where
+// they are those of elastic forces alone, else what the correction has changed.
+template <bool HasContacts, class W>
+PD_HD W rise_of(const W& inertia, const Vec3<W>& x, const Vec3<W>& target, const Candidate<W>& kept,
+                const Candidate<W>& moved) {
+  const Vec3<W> before = kept.first - target, after = moved.first - target;
+  W rise = W(0.5) * (dot(after, after) - dot(before, before));
+  if constexpr (HasContacts) {
+    const auto work = [&](const Candidate<W>& of, const Vec3<W>& answered) {
+      const Vec3<W> u = of.first + of.motion.of(x + of.first);
+      return dot(u - answered, of.last - u);
+    };
+    rise = rise + (work(moved, moved.first) - work(kept, target));
+  }
+  return inertia * rise;
+}
+
 }  // namespace pd::inline PD_TARGET
