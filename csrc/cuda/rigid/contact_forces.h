@@ -132,13 +132,15 @@ struct Correction {
     return guess(i, vertex);
   }
 
-  // Of its energy, from the present shape to the guess, both before their corrections.
-  PD_DEVICE double rise_of(int i, int vertex) const {
-    const Vec3<double> target = widened<double>(vec3(v.target[i]));
-    const Vec3<double> after = widened<double>(guess(i, vertex)) - target;
-    const Vec3<double> before = widened<double>(present(i)) - target;
-    const double inertia = double(v.inertia(i)) * (dot(after, after) - dot(before, before));
-    return multiply_add(0.5, inertia, double(__ldcg(forces.work + vertex)));
+  // Of its energy, from the present shape to the guess. `kept`, `moved`: motions of its piece.
+  PD_DEVICE double rise_of(int i, int vertex, const RigidMotion<double>& kept,
+                           const RigidMotion<double>& moved) const {
+    const auto wide = [](const Vec3<T>& a) { return widened<double>(a); };
+    const Candidate<double> before = {wide(present(i)), wide(vec3(v.before[i])), kept};
+    const Candidate<double> after = {wide(guess(i, vertex)), wide(vec3(v.u[i])), moved};
+    return double(__ldcg(forces.work + vertex)) +
+           pd::rise_of<HasContacts>(double(v.inertia(i)), wide(vec3(v.x[i])),
+                                    wide(vec3(v.target[i])), before, after);
   }
 
   // The first iterate, also the previous one of the first iteration. A piece that pins clamp takes the guess.

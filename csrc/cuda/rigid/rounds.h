@@ -19,7 +19,9 @@ struct PartSums {
 
 struct Piece {
   double sum[RigidSums::count], contact[ContactSums::count], rise;  // over all its parts
-  double reached;                                                   // by the correction before
+  // of the correction before
+  double reached;
+  RigidMotion<double> motion_before;
   CoarseBody body;
 };
 
@@ -149,7 +151,9 @@ PD_DEVICE_COLD void sum_part(const Correction<T, HasContacts>& of, const DeviceP
     write_shares(sum, to);
   } else {
     double sum[1] = {};
-    part.each([&](int i, int vertex) { sum[0] += of.rise_of(i, vertex); });
+    part.each([&](int i, int vertex) {
+      sum[0] += of.rise_of(i, vertex, piece.motion_before, piece.body.motion());
+    });
     write_shares(sum, to);
   }
 }
@@ -207,6 +211,7 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_co
     if (!leader) return;
     for (int n = S::pins; n < S::count && plan.pins == 0; ++n) to.sum[n] = 0;
     to.reached = to.body.reached();
+    to.motion_before = to.body.motion();
     to.body = CoarseBody(RigidBody(to.sum));
     if (!has_contacts) to.body.move_free();
   } else if constexpr (What == Round::contacts) {
