@@ -117,6 +117,29 @@ def test_it_starts_in_the_shape_of_less_energy(
     assert np.abs(found - problem.align(first)).max() <= 1e-5 * size
 
 
+def sinking(youngs: float) -> Case:
+    """A single tetrahedron, one corner of which comes below the ground."""
+    corners = np.array([[0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [0.0, 0.25, 0.2], [-0.2, 0.3, -0.1]])
+    mesh = pd.TetMesh(corners, np.array([[0, 2, 1, 3]]))
+    scene = pd.Scene(pd.Solid(mesh, youngs), pd.Gravity(), pd.Ground(0.0))
+    return Case(scene, corners, np.tile([0.0, -0.6, 0.0], (4, 1)), H)
+
+
+@pytest.mark.parametrize("youngs", [1e2, 1e4, 1e5, 1e6, 1e7])
+def test_what_the_ground_pushes_weighs_in_the_choice(youngs: float, dtype: torch.dtype, device: torch.device) -> None:
+    """A push of the present shape leaves that corner behind the others: inertia that its elastic anchors know nothing of."""
+    case = sinking(youngs)
+    problem = rounded_problem(case, dtype)
+    still = np.zeros_like(problem.positions)
+    guess, present = problem.align(problem.unsolved()), correct(problem, still, still[None]).displacement
+    assert (problem.energy(guess) < 0.97 * problem.energy(present)) == (youngs <= 1e5)
+    first = problem.first_iterate()
+    assert np.abs(first - (guess if youngs <= 1e5 else present)).max() <= 1e-5 * np.abs(first).max()
+    sim = simulator(case, dtype, device, iterations=0)
+    found = displacement(sim, sim(state_of(case, sim)))
+    assert np.abs(found - problem.align(first)).max() <= 1e-5 * np.abs(first).max()
+
+
 def test_environments_choose_for_themselves(device: torch.device) -> None:
     """The same state in soft and stiff materials, beside each other and alone."""
     case = stretching(1e4, pd.Ground(0.0))
@@ -188,13 +211,13 @@ def dropped(number: int) -> Case:
     x = (vertices - vertices.mean(axis=0)) @ turn.T
     x[:, 1] += rng.choice([0.0, 0.001, 0.02]) - x[:, 1].min()
     v = [0.0, -rng.uniform(0.5, 2.0), 0.0] + np.cross(3.0 * rng.standard_normal(3), x - x.mean(axis=0))
-    return Case(pd.Scene(pd.Solid(pd.TetMesh(x, tets), 1e9), pd.Gravity(), pd.Ground()), x, v, H)
+    return Case(pd.Scene(pd.Solid(pd.TetMesh(x, tets), 1e11), pd.Gravity(), pd.Ground()), x, v, H)
 
 
 def test_it_lands_where_energy_is_least_along_rigid_motions(device: torch.device) -> None:
     """On a face, an edge or a corner, or from one on to another, as SciPy's SLSQP finds too.
 
-    Some leave a vertex above the ground by what counts as lying, a hundredth of the way that the ground stops.
+    So stiff that contacts yield by less than the assertions ask.
     """
     left = []
     for case in map(dropped, range(60)):
@@ -205,5 +228,5 @@ def test_it_lands_where_energy_is_least_along_rigid_motions(device: torch.device
             left.append(np.linalg.norm(found - best) / np.linalg.norm(best))
     assert len(left) >= 50
     assert np.median(left) <= 1e-5
-    assert np.quantile(left, 0.75) <= 1e-3
-    assert max(left) <= 0.1
+    assert np.quantile(left, 0.75) <= 1e-5
+    assert max(left) <= 1e-4
