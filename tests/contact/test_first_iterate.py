@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import torchpd as pd
-from torchpd.reference import StepProblem
+from torchpd.reference import StepProblem, step_problem
 from torchpd.reference.coarse import correct
 
 pytestmark = pytest.mark.usefixtures("poisoned")
@@ -127,7 +127,7 @@ def sinking(youngs: float) -> Case:
 
 @pytest.mark.parametrize("youngs", [1e2, 1e4, 1e5, 1e6, 1e7])
 def test_what_the_ground_pushes_weighs_in_the_choice(youngs: float, dtype: torch.dtype, device: torch.device) -> None:
-    """A push of the present shape leaves that corner behind the others: inertia that its elastic anchors know nothing of."""
+    """A push of the present shape leaves a corner behind: inertia that anchors of elastic forces do not answer."""
     case = sinking(youngs)
     problem = rounded_problem(case, dtype)
     still = np.zeros_like(problem.positions)
@@ -153,6 +153,21 @@ def test_environments_choose_for_themselves(device: torch.device) -> None:
         assert torch.equal(after.positions[n], alone(state_of(case, alone)).positions[0])
         longer.append(float(after.positions[n, :, 0].max() - after.positions[n, :, 0].min()) > 0.302)
     assert longer == [factor <= 1.0 for factor in factors.tolist()]
+
+
+def test_a_body_on_the_ground_is_not_moved_into_it() -> None:
+    """Of two blocks one falls exactly. The other gives in and tilts by weight / sum D: D differs by corner."""
+    low, high = contact_block(), contact_block(height=3.0)
+    bodies = [pd.Solid(pd.TetMesh(case.positions, case.scene.values().tets), 1e5) for case in (low, high)]
+    values = pd.Scene(*bodies, pd.Gravity(), pd.Ground()).values()
+    problem = step_problem(values, values.rest_positions, 0.0 * values.rest_positions, H)
+    first = problem.first_iterate()
+    foot = values.rest_positions[:64, 1] == 0.0
+    np.testing.assert_allclose(first[:64][foot, 1], 0.0, atol=1e-17)
+    np.testing.assert_allclose(problem.weight[:64] @ first[:64, [0, 2]], 0.0, atol=1e-17 * problem.weight[:64].sum())
+    give = values.masses[:64].sum() * -values.gravity[1] / problem.diagonal[:64][foot].sum()
+    assert np.abs(first[:64]).max() <= 2.0 * give
+    np.testing.assert_allclose(first[64:], np.tile(H**2 * values.gravity, (64, 1)), atol=1e-15)
 
 
 def pinned(case: Case) -> Case:
