@@ -86,13 +86,8 @@ class CoarseBody {
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
-    return {accepted_.turn,
-            trial_.turn,
-            body_.center,
-            accepted_.shift,
-            trial_.shift,
-            finite_ ? 1.0 : 0.0,
-            !finite_ && way_ > 0 && way_ <= near_share * size_ ? 0.5 : 0.0};
+    return {accepted_.turn, trial_.turn,         body_.center,       accepted_.shift,
+            trial_.shift,   finite_ ? 1.0 : 0.0, renews_ ? 0.5 : 0.0};
   }
 
   // All passes of a body without contacts.
@@ -104,6 +99,9 @@ class CoarseBody {
   PD_COLD void pass(const double (&sum)[ContactSums::count]) {
     if (finite_) {
       end_motion(sum);
+    } else if (renews_) {
+      renews_ = false;
+      next_step(sum);
     } else {
       go_on(sum);
     }
@@ -160,9 +158,15 @@ class CoarseBody {
       return try_step();
     }
     for (int i = 0; i < 6; ++i) twist_[i] = at[i];
+    ++steps_;
     const bool settled = sum[S::lag] <= still_share * still_share * sum[S::radius];
-    if ((way_ <= still_share * size_ && settled) || ++steps_ >= most_steps) return try_motion();
-    begin_step(sum);
+    if (settled && way_ <= still_share * size_) return try_motion();
+    renews_ = !settled && way_ <= near_share * size_;
+    if (!renews_) next_step(sum);
+  }
+
+  PD_HD void next_step(const double (&sum)[ContactSums::count]) {
+    steps_ < most_steps ? begin_step(sum) : try_motion();
   }
 
   PD_HD void begin_step(const double (&sum)[ContactSums::count]) {
@@ -279,7 +283,7 @@ class CoarseBody {
   double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
   double way_ = 0, slope_ = 0, contact_energy_ = 0;
   int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
-  bool finite_ = true, done_ = true;
+  bool finite_ = true, renews_ = false, done_ = true;
 };
 
 // One of the two first iterates of a step, at a vertex: its displacement before and after the correction, and the motion of
