@@ -170,7 +170,7 @@ def reference(name: str, dtype: torch.dtype, solver: str, iterations: int) -> It
     return reference_run(problem, first_iterate(name, dtype, solver), ALL_SOLVERS[solver], iterations)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Rounded(StepProblem):
     """The problem with what float32 has to round in an iteration: x + u, as seen from a vertex, forces and their sums.
 

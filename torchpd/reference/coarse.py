@@ -39,8 +39,8 @@ OUTER = 6  # finite motions
 PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-STILL = 1e-6  # of the size of a body, and of the friction radii: a step that ends the passes
-NEAR = 1e-3  # of the size: a step within which friction radii move half way to friction l
+STILL = 1e-6  # of the size of a body, and of the friction radii: a motion that ends the passes, and a lag that is none
+SETTLED = 0.1  # of a motion, and of the friction radii: a step, and a lag, that end the way to one of the finite motions
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
@@ -282,8 +282,7 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
 def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
-    Newton's steps, each ended where the model is least along it. Radii move half way to friction l where a step is near
-    enough to the minimum.
+    Newton's steps, each ended where the model is least along it. Radii become friction l after each.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -316,10 +315,12 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
                 low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
         motion, share = motion + high * step, motions.share(high * step)
         lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
-        if share <= STILL and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
+        behind, size = np.linalg.norm(lag), np.linalg.norm(radius)
+        ends = share <= max(STILL, SETTLED * motions.share(motion)) and behind <= SETTLED * size
+        if behind > STILL * size:
+            radius = radius + lag
+        if ends:
             break
-        if share <= NEAR:
-            radius = radius + 0.5 * lag
     return motion, radius
 
 

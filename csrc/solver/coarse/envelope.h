@@ -82,9 +82,12 @@ struct Envelope {
 // Sums over the contacts of a body: of their energies before and after a motion, of the second derivative and the force by
 // the twist after it, and of the squares of friction l - r and of r.
 struct ContactSums {
-  static constexpr int before = 0, after = 1, matrix = 2, force = 23, lag = 29, radius = 30, count = 31;
+  static constexpr int before = 0, after = 1, matrix = 2, force = 23, lag = 29, radius = 30,
+                       count = 31;
   // the lower triangle, row by row
-  PD_HD static constexpr int at(int row, int column) { return matrix + row * (row + 1) / 2 + column; }
+  PD_HD static constexpr int at(int row, int column) {
+    return matrix + row * (row + 1) / 2 + column;
+  }
 };
 
 // Adds J^T k J and J^T f: k = `across` (1 - n n^T) + `along` n n^T, J the displacement of a vertex at `arm` by a twist, n = `normal`.
@@ -103,8 +106,8 @@ PD_HD void add_twist_terms(W (&sum)[ContactSums::count], const Vec3<W>& arm, con
     sum[S::force + i] = sum[S::force + i] + f[i];
     const W scaled = more * n[i];
     for (int j = 0; j <= i; ++j) {
-      const W plain = i < 3   ? (i == j ? across : none)
-                      : j < 3 ? across * x[i - 3][j]
+      const W plain = i < 3    ? (i == j ? across : none)
+                      : j < 3  ? across * x[i - 3][j]
                       : i == j ? across * (square - r[i - 3] * r[i - 3])
                                : -(across * (r[i - 3] * r[j - 3]));
       sum[S::at(i, j)] = multiply_add(scaled, n[j], sum[S::at(i, j)] + plain);
@@ -135,12 +138,14 @@ template <class W, class R, class Visit>
 PD_HD void each_contact(const Contacts<R>& contacts, const Visit& visit) {
   for (int i = 0; i < contacts.plane_count; ++i) {
     const Plane<R>& p = contacts.planes[i];
-    visit(i, Plane<W>{widened<W>(p.normal), convert<double>(p.height), convert<double>(p.friction)});
+    visit(i,
+          Plane<W>{widened<W>(p.normal), convert<double>(p.height), convert<double>(p.friction)});
   }
   for (int i = 0; i < contacts.sphere_count; ++i) {
     const Sphere<R>& s = contacts.spheres[i];
-    visit(contacts.plane_count + i, Sphere<W>{widened<W>(s.center), widened<W>(s.motion),
-                                              convert<double>(s.radius), convert<double>(s.friction)});
+    visit(contacts.plane_count + i,
+          Sphere<W>{widened<W>(s.center), widened<W>(s.motion), convert<double>(s.radius),
+                    convert<double>(s.friction)});
   }
 }
 
@@ -184,18 +189,19 @@ PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
 }
 
 // What a round asks of a body's vertices, per environment: the accepted motion and the trial, a finite motion, or to first
-// order a twist about the moved centre. `renews`: the share by which radii move toward friction l.
+// order a twist about the moved centre. `renews`: whether radii become friction l.
 template <class W>
 struct CoarseTrial {
   Mat3<W> turn_before, turn_after;  // R - I; to first order [w]x R
   Vec3<W> center, shift_before, shift_after;
-  W finite, renews;  // 1 or 0; 0.5 or 0
+  W finite, renews;  // 1 or 0
 };
 
 // Adds the contacts of a vertex. `forces[n stride]`: ContactForce of contact n.
 template <class R, class W, class Forces>
 PD_HD void add_contacts(W (&sum)[ContactSums::count], const Contacts<R>& contacts,
-                        const CoarseVertex<W>& v, const CoarseTrial<W>& trial, const Forces& forces) {
+                        const CoarseVertex<W>& v, const CoarseTrial<W>& trial,
+                        const Forces& forces) {
   using S = ContactSums;
   const Vec3<W> arm = (v.x + v.u) - trial.center, turned = trial.turn_before * arm;
   const Vec3<W> first = v.u + (turned + trial.shift_before);
@@ -212,9 +218,11 @@ PD_HD void add_contacts(W (&sum)[ContactSums::count], const Contacts<R>& contact
     W radius = forces.radius(n);
     // by the normal of before, so that both energies are of one function
     const Envelope<W> old(stiffness, force, before.normal);
-    const Surface<W> there = {before.normal, select(finite, after.gap, before.gap + dot(before.normal, moved)),
+    const Surface<W> there = {before.normal,
+                              select(finite, after.gap, before.gap + dot(before.normal, moved)),
                               before.slip + tangential(moved, before.normal)};
-    after = {select(finite, after.normal, there.normal), there.gap, select(finite, after.slip, there.slip)};
+    after = {select(finite, after.normal, there.normal), there.gap,
+             select(finite, after.slip, there.slip)};
     const Envelope<W> now(stiffness, force, after.normal);
     const W normal = now.normal_force(after.gap);
     if (!any(((old.normal_force(before.gap) + normal) + radius) + dot(force, force) > none)) return;

@@ -1,9 +1,9 @@
 // The rigid motion of a body with the least energy Phi: its quadratics (solver/coarse/sums.h) and the envelopes of its contacts
 // (solver/coarse/envelope.h).
 //
-// Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each ended
-// where Phi is least along it, and radii of friction that move half way to friction times l near the minimum. The motion is halved
-// until Phi itself has not risen. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
+// Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each
+// ended where Phi is least along it. After each, radii of friction become friction times l. The motion is halved until Phi itself
+// has not risen. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
 #include "solver/coarse/sums.h"
@@ -20,8 +20,10 @@ struct RigidMotion {
 };
 
 constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 30;
-// Shares of the size of a body, and of a radius: a step that ends the passes, and one within which radii are renewed.
-constexpr double still_share = 1e-6, near_share = 1e-3;
+// Of the size of a body, and of the radii: a motion that ends the passes, and a lag that is none.
+constexpr double still_share = 1e-6;
+// Of a motion, and of the radii: a step, and a lag, that end the way to one of the finite motions.
+constexpr double settled_share = 0.1;
 // Of the energy that moves a body by its size: a rise that is rounding.
 constexpr double energy_rounding = 1e-14;
 // Of the slope of Phi where a step begins: none.
@@ -87,7 +89,7 @@ class CoarseBody {
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
     return {accepted_.turn, trial_.turn,         body_.center,       accepted_.shift,
-            trial_.shift,   finite_ ? 1.0 : 0.0, renews_ ? 0.5 : 0.0};
+            trial_.shift,   finite_ ? 1.0 : 0.0, renews_ ? 1.0 : 0.0};
   }
 
   // All passes of a body without contacts.
@@ -159,14 +161,17 @@ class CoarseBody {
     }
     for (int i = 0; i < 6; ++i) twist_[i] = at[i];
     ++steps_;
-    const bool settled = sum[S::lag] <= still_share * still_share * sum[S::radius];
-    if (settled && way_ <= still_share * size_) return try_motion();
-    renews_ = !settled && way_ <= near_share * size_;
+    const double lag = sum[S::lag], radius = sum[S::radius];
+    const double least = still_share * size_, share = settled_share * length_of(twist_);
+    const double small = least > share ? least : share;
+    ends_ =
+        (way_ <= small && lag <= settled_share * settled_share * radius) || steps_ >= most_steps;
+    renews_ = lag > still_share * still_share * radius;
     if (!renews_) next_step(sum);
   }
 
   PD_HD void next_step(const double (&sum)[ContactSums::count]) {
-    steps_ < most_steps ? begin_step(sum) : try_motion();
+    ends_ ? try_motion() : begin_step(sum);
   }
 
   PD_HD void begin_step(const double (&sum)[ContactSums::count]) {
@@ -283,7 +288,7 @@ class CoarseBody {
   double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
   double way_ = 0, slope_ = 0, contact_energy_ = 0;
   int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
-  bool finite_ = true, renews_ = false, done_ = true;
+  bool finite_ = true, ends_ = false, renews_ = false, done_ = true;
 };
 
 // One of the two first iterates of a step, at a vertex: its displacement before and after the correction, and the motion of
