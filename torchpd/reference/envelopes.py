@@ -112,21 +112,26 @@ def contacts_at(
 ) -> Envelopes:
     """Contacts of free vertices with all planes and spheres, then the pairs, at an iterate.
 
-    `forces` [C, V, 3] N are those of every plane and sphere (`pushes_of`).
+    `forces` [C, V, 3] N are those of every plane and sphere (`pushes_of`). P projects out of one after another; so each
+    has its gap and slip where P comes to it: before the pushes of those after it.
     """
     values, free = problem.values, vertices[problem.free[vertices]]
     u, y = displacement[free], problem.positions[free] + displacement[free]
     normals, gaps, slips, friction = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros((0, 3))], [np.zeros(0)]
-    for plane in values.planes:
+    # how far the contacts after each one push a vertex in a plain iteration
+    onto = np.cumsum(forces[::-1, free], axis=0)[::-1] - forces[:, free]
+    onto /= problem.diagonal[free, None]
+    for plane, later in zip(values.planes, onto, strict=False):
         normals.append(np.tile(plane[PLANES["normal"]], (len(free), 1)))
-        gaps.append(y @ plane[PLANES["normal"]] - plane[PLANES["height"]])
-        slips.append(u)
+        gaps.append((y - later) @ plane[PLANES["normal"]] - plane[PLANES["height"]])
+        slips.append(u - later)
         friction.append(np.full(len(free), plane[PLANES["friction"]]))
-    for center, motion, sphere in zip(problem.sphere_centers, problem.sphere_motions, values.spheres, strict=True):
+    spheres = zip(problem.sphere_centers, problem.sphere_motions, values.spheres, strict=True)
+    for (center, motion, sphere), later in zip(spheres, onto[len(values.planes) :], strict=True):
         outward, lengths = sphere_normals(y, center)
         normals.append(outward)
-        gaps.append(lengths - sphere[SPHERES["radius"]])
-        slips.append(u - motion)
+        gaps.append(lengths - (later * outward).sum(axis=1) - sphere[SPHERES["radius"]])
+        slips.append(u - motion - later)
         friction.append(np.full(len(free), sphere[SPHERES["friction"]]))
     index = np.tile(free, len(values.planes) + len(values.spheres))[:, None]
     weights, anchors = np.ones(index.shape), forces[:, free].reshape(-1, 3)

@@ -133,6 +133,11 @@ PD_HD Surface<W> surface_at(const Sphere<W>& sphere, const Vec3<W>& x, const Vec
   return {normal, gap(sphere, x + u), tangential(u - sphere.motion, normal)};
 }
 
+template <class W>
+PD_HD Surface<W> before_pushes(const Surface<W>& at, const Vec3<W>& pushes) {
+  return {at.normal, at.gap - dot(at.normal, pushes), at.slip - tangential(pushes, at.normal)};
+}
+
 // Calls visit(n, plane or sphere in double) for contact n.
 template <class W, class R, class Visit>
 PD_HD void each_contact(const Contacts<R>& contacts, const Visit& visit) {
@@ -147,6 +152,21 @@ PD_HD void each_contact(const Contacts<R>& contacts, const Visit& visit) {
           Sphere<W>{widened<W>(s.center), widened<W>(s.motion), convert<double>(s.radius),
                     convert<double>(s.friction)});
   }
+}
+
+// Calls visit(n, plane or sphere, how far the contacts after it push the vertex at the iterate). The projection goes from one
+// contact to the next, so each has its gap and slip before the pushes of those after it.
+template <class W, class R, class Forces, class Visit>
+PD_HD void each_contact_in_turn(const Contacts<R>& contacts, const W& inverse, const Forces& forces,
+                                const Visit& visit) {
+  const W none(0.0);
+  const int count = contacts.plane_count + contacts.sphere_count;
+  Vec3<W> later = {none, none, none};
+  for (int n = 1; n < count; ++n) later = later + forces.force(n);
+  each_contact<W>(contacts, [&](int n, const auto& shape) {
+    if (n > 0) later = later - forces.force(n);
+    visit(n, shape, inverse * later);
+  });
 }
 
 // Keeps the forces with which the contacts stop a plain iteration at `free`.
@@ -180,11 +200,12 @@ PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
   const W none(0.0), one(1.0), stiffness = select(v.stiffness > none, v.stiffness, one);
   const W inverse = select(v.stiffness > none, one / stiffness, none);
   Vec3<W> push = {none, none, none};
-  each_contact<W>(contacts, [&](int n, const auto& shape) {
-    const Surface<W> at = surface_at(shape, v.x, v.u + push);
-    const Envelope<W> envelope(stiffness, forces.force(n), at.normal);
-    push = push + inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
-  });
+  each_contact_in_turn<W>(
+      contacts, inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
+        const Surface<W> at = before_pushes(surface_at(shape, v.x, v.u + push), later);
+        const Envelope<W> envelope(stiffness, forces.force(n), at.normal);
+        push = push + inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
+      });
   return push;
 }
 
@@ -210,35 +231,37 @@ PD_HD void add_contacts(W (&sum)[ContactSums::count], const Contacts<R>& contact
   const W stiffness = select(v.stiffness > none, v.stiffness, W(1.0));
   const auto finite = trial.finite > none;
   const Vec3<W> lever = arm + select(finite, way, turned);
-  each_contact<W>(contacts, [&](int n, const auto& shape) {
-    const Surface<W> before = surface_at(shape, v.x, first);
-    Surface<W> after = surface_at(shape, v.x, then);
-    const W friction = shape.friction;
-    const Vec3<W> force = forces.force(n), moved = then - first;
-    W radius = forces.radius(n);
-    // by the normal of before, so that both energies are of one function
-    const Envelope<W> old(stiffness, force, before.normal);
-    const Surface<W> there = {before.normal,
-                              select(finite, after.gap, before.gap + dot(before.normal, moved)),
-                              before.slip + tangential(moved, before.normal)};
-    after = {select(finite, after.normal, there.normal), there.gap,
-             select(finite, after.slip, there.slip)};
-    const Envelope<W> now(stiffness, force, after.normal);
-    const W normal = now.normal_force(after.gap);
-    if (!any(((old.normal_force(before.gap) + normal) + radius) + dot(force, force) > none)) return;
-    sum[S::before] = multiply_add(free, old.energy(before, radius), sum[S::before]);
-    sum[S::after] = multiply_add(free, old.energy(there, radius), sum[S::after]);
-    radius = multiply_add(trial.renews, friction * normal - radius, radius);
-    forces.set_radius(n, radius);
-    const W lag = friction * normal - radius;
-    sum[S::lag] = multiply_add(free * lag, lag, sum[S::lag]);
-    sum[S::radius] = multiply_add(free * radius, radius, sum[S::radius]);
-    const auto rub = now.rub(after.slip, radius);
-    const W across = free * (rub.share * stiffness);
-    const W along = select(normal > none, free * stiffness, none);
-    const Vec3<W> pull = free * multiply_add(normal, after.normal, rub.share * rub.pull);
-    add_twist_terms(sum, lever, after.normal, pull, across, along);
-  });
+  each_contact_in_turn<W>(
+      contacts, free / stiffness, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
+        const Surface<W> before = before_pushes(surface_at(shape, v.x, first), later);
+        Surface<W> after = before_pushes(surface_at(shape, v.x, then), later);
+        const W friction = shape.friction;
+        const Vec3<W> force = forces.force(n), moved = then - first;
+        W radius = forces.radius(n);
+        // by the normal of before, so that both energies are of one function
+        const Envelope<W> old(stiffness, force, before.normal);
+        const Surface<W> there = {before.normal,
+                                  select(finite, after.gap, before.gap + dot(before.normal, moved)),
+                                  before.slip + tangential(moved, before.normal)};
+        after = {select(finite, after.normal, there.normal), there.gap,
+                 select(finite, after.slip, there.slip)};
+        const Envelope<W> now(stiffness, force, after.normal);
+        const W normal = now.normal_force(after.gap);
+        if (!any(((old.normal_force(before.gap) + normal) + radius) + dot(force, force) > none))
+          return;
+        sum[S::before] = multiply_add(free, old.energy(before, radius), sum[S::before]);
+        sum[S::after] = multiply_add(free, old.energy(there, radius), sum[S::after]);
+        radius = multiply_add(trial.renews, friction * normal - radius, radius);
+        forces.set_radius(n, radius);
+        const W lag = friction * normal - radius;
+        sum[S::lag] = multiply_add(free * lag, lag, sum[S::lag]);
+        sum[S::radius] = multiply_add(free * radius, radius, sum[S::radius]);
+        const auto rub = now.rub(after.slip, radius);
+        const W across = free * (rub.share * stiffness);
+        const W along = select(normal > none, free * stiffness, none);
+        const Vec3<W> pull = free * multiply_add(normal, after.normal, rub.share * rub.pull);
+        add_twist_terms(sum, lever, after.normal, pull, across, along);
+      });
 }
 
 }  // namespace pd::inline PD_TARGET
