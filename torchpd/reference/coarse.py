@@ -40,7 +40,7 @@ PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
 STILL = 1e-6  # of the size of a body, and of the friction radii: a motion that ends the passes, and a lag that is none
-SETTLED = 0.1  # of a motion, and of the friction radii: a step, and a lag, that end the way to one of the finite motions
+SETTLED = 0.1  # of a motion: a step after which friction radii become friction l; of these: a lag that ends the steps
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
@@ -282,7 +282,8 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
 def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
-    Newton's steps, each ended where the model is least along it. Radii become friction l after each.
+    Newton's steps, each ended where the model is least along it. Radii become friction l after one that is small beside
+    the motion.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -315,11 +316,12 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
                 low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
         motion, share = motion + high * step, motions.share(high * step)
         lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
+        if share > max(STILL, SETTLED * motions.share(motion)):
+            continue
         behind, size = np.linalg.norm(lag), np.linalg.norm(radius)
-        ends = share <= max(STILL, SETTLED * motions.share(motion)) and behind <= SETTLED * size
         if behind > STILL * size:
             radius = radius + lag
-        if ends:
+        if behind <= SETTLED * size:
             break
     return motion, radius
 

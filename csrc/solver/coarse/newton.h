@@ -2,8 +2,8 @@
 // (solver/coarse/envelope.h).
 //
 // Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each
-// ended where Phi is least along it. After each, radii of friction become friction times l. The motion is halved until Phi itself
-// has not risen. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
+// ended where Phi is least along it. After one that is small beside the motion, radii of friction become friction times l. The
+// motion is halved until Phi itself has not risen. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
 #include "solver/coarse/sums.h"
@@ -22,12 +22,12 @@ struct RigidMotion {
 constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 30;
 // Of the size of a body, and of the radii: a motion that ends the passes, and a lag that is none.
 constexpr double still_share = 1e-6;
-// Of a motion, and of the radii: a step, and a lag, that end the way to one of the finite motions.
+// Of a motion: a step after which radii are renewed. Of these: a lag that ends the steps.
 constexpr double settled_share = 0.1;
 // Of the energy that moves a body by its size: a rise that is rounding.
 constexpr double energy_rounding = 1e-14;
-// Of the slope of Phi where a step begins: none.
-constexpr double no_slope = 1e-9;
+// Of the size of a body: how far a search along a step moves at its end.
+constexpr double exact_share = 1e-9;
 // Of the largest pivot: no inertia, such as that of a line about itself.
 constexpr double no_pivot = 1e-12;
 
@@ -150,13 +150,14 @@ class CoarseBody {
       for (int j = 0; j <= i; ++j)
         second += (i == j ? 1.0 : 2.0) * step_[i] * step_[j] * matrix[i * (i + 1) / 2 + j];
     }
-    const bool ends =
-        share_ == 1.0 ? slope <= no_slope * slope_ : absolute(slope) <= no_slope * slope_;
+    // the slope rises: Newton's step within the bracket, or its middle
+    (slope < 0 ? low_ : high_) = share_;
+    double next = share_ - slope / second;
+    if (!(low_ < next && next < high_)) next = 0.5 * (low_ + high_);
+    const bool ends = (share_ == 1.0 && !(slope > 0)) ||
+                      absolute(next - share_) * length_of(step_) <= exact_share * size_;
     if (!ends && ++searches_ <= most_searches) {
-      (slope < 0 ? low_ : high_) = share_;
-      // the slope rises: Newton's step within the bracket, or its middle
-      const double next = share_ - slope / second;
-      share_ = low_ < next && next < high_ ? next : 0.5 * (low_ + high_);
+      share_ = next;
       return try_step();
     }
     for (int i = 0; i < 6; ++i) twist_[i] = at[i];
@@ -164,9 +165,9 @@ class CoarseBody {
     const double lag = sum[S::lag], radius = sum[S::radius];
     const double least = still_share * size_, share = settled_share * length_of(twist_);
     const double small = least > share ? least : share;
-    ends_ =
-        (way_ <= small && lag <= settled_share * settled_share * radius) || steps_ >= most_steps;
-    renews_ = lag > still_share * still_share * radius;
+    const bool near = way_ <= small;
+    ends_ = (near && lag <= settled_share * settled_share * radius) || steps_ >= most_steps;
+    renews_ = near && lag > still_share * still_share * radius;
     if (!renews_) next_step(sum);
   }
 
@@ -179,8 +180,6 @@ class CoarseBody {
     find_terms(twist_, sum, force, matrix);
     for (int i = 0; i < 6; ++i) step_[i] = force[i];
     solve_6x6(matrix, step_);
-    slope_ = 0;
-    for (int i = 0; i < 6; ++i) slope_ += force[i] * step_[i];
     searches_ = 0;
     low_ = 0, high_ = share_ = 1;
     try_step();
@@ -286,7 +285,7 @@ class CoarseBody {
   Vec3<double> force_, moment_;
   double size_, length_;  // length_: 1 / size_
   double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
-  double way_ = 0, slope_ = 0, contact_energy_ = 0;
+  double way_ = 0, contact_energy_ = 0;
   int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
   bool finite_ = true, ends_ = false, renews_ = false, done_ = true;
 };
