@@ -41,11 +41,11 @@ DIVERGED = 100.0
 def tolerance_of(problem: StepProblem, displacement: Array, dtype: torch.dtype) -> float:
     """The bound, relative to the displacement.
 
-    Newton's steps on contacts with friction converge linearly, and end at 1e-6 of the size: rounding may add one more.
+    Newton's steps on contacts with friction converge linearly, and end at 1e-7 of the size: rounding may add one more.
     """
     contacts = len(problem.values.planes) + len(problem.values.spheres)
     size = float(np.ptp(problem.positions, axis=0).max())
-    ended = 1e-6 * size / float(np.abs(displacement).max()) if contacts else 0.0
+    ended = 1e-7 * size / float(np.abs(displacement).max()) if contacts else 0.0
     return max(TOLERANCE[dtype], ended)
 
 

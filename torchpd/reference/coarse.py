@@ -39,7 +39,7 @@ OUTER = 6  # finite motions
 PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-STILL = 1e-6  # of the size of a body, and of the friction radii: a motion that ends the passes, and a lag that is none
+STILL = 1e-7  # of the size of a body, and of the friction radii: a motion that ends the passes, and a lag that is none
 SETTLED = 0.1  # of a motion: a step after which friction radii become friction l; of these: a lag that ends the steps
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 

@@ -3,6 +3,7 @@
 #pragma once
 #include "cuda/common/reductions.h"
 #include "cuda/rigid/contact_forces.h"
+#include "cuda/rigid/warp_terms.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -195,7 +196,17 @@ PD_DEVICE void sum_over_parts(const DevicePlan<T>& plan, int piece, const double
   __syncwarp();
 }
 
-// `part_sum`: [parts, PartSums::count]. One lane decides for its piece.
+// A body that all lanes change alike: each on its own copy.
+template <class Change>
+PD_DEVICE void of_the_warp(CoarseBody& body, const Change& change) {
+  CoarseBody copy = body;
+  change(copy);
+  __syncwarp();
+  if (threadIdx.x % warp_size == 0) body = copy;
+  __syncwarp();
+}
+
+// `part_sum`: [parts, PartSums::count]. A warp for a piece.
 template <Round What, class T>
 PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts,
                                const double* part_sum, Piece& to) {
@@ -208,16 +219,18 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_co
     if (has_whole_parts(plan)) sum_over_parts<S::target_offset>(plan, piece, part_sum, 0, to.sum);
     sum_over_parts<moments>(plan, piece, part_sum, S::target_offset, to.sum + S::target_offset);
     if (plan.pins > 0) sum_over_parts<pins>(plan, piece, part_sum, S::pins, to.sum + S::pins);
-    if (!leader) return;
-    for (int n = S::pins; n < S::count && plan.pins == 0; ++n) to.sum[n] = 0;
-    to.reached = to.body.reached();
-    to.motion_before = to.body.motion();
-    to.body = CoarseBody(RigidBody(to.sum));
-    if (!has_contacts) to.body.move_free();
+    if (leader) {
+      for (int n = S::pins; n < S::count && plan.pins == 0; ++n) to.sum[n] = 0;
+      to.reached = to.body.reached();
+      to.motion_before = to.body.motion();
+      to.body = CoarseBody(RigidBody(to.sum));
+    }
+    __syncwarp();
+    if (!has_contacts) of_the_warp(to.body, [](CoarseBody& body) { body.move_free<WarpTerms>(); });
   } else if constexpr (What == Round::contacts) {
     if (to.body.is_done()) return;
     sum_over_parts<ContactSums::count>(plan, piece, part_sum, 0, to.contact);
-    if (leader) to.body.pass(to.contact);
+    of_the_warp(to.body, [&](CoarseBody& body) { body.pass<WarpTerms>(to.contact); });
   } else {
     sum_over_parts<1>(plan, piece, part_sum, 0, &to.rise);
     if (leader) to.rise += to.body.reached() - to.reached;

@@ -21,7 +21,7 @@ struct RigidMotion {
 
 constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 30;
 // Of the size of a body, and of the radii: a motion that ends the passes, and a lag that is none.
-constexpr double still_share = 1e-6;
+constexpr double still_share = 1e-7;
 // Of a motion: a step after which radii are renewed. Of these: a lag that ends the steps.
 constexpr double settled_share = 0.1;
 // Of the energy that moves a body by its size: a rise that is rounding.
@@ -46,29 +46,53 @@ PD_HD bool is_positive(const Mat3<double>& a) {
          determinant(a) > 0;
 }
 
-// x with A x = b for a symmetric A that is not negative, by its lower triangle, row by row; 0 along rows without pivot.
-PD_CALLED inline void solve_6x6(double (&a)[21], double (&b)[6]) {
-  const auto at = [](int i, int j) { return i * (i + 1) / 2 + j; };
-  double most = 0, inverse[6];
-  for (int i = 0; i < 6; ++i) most = a[at(i, i)] > most ? a[at(i, i)] : most;
-  // A = L D L^T
-  for (int j = 0; j < 6; ++j) {
-    const double pivot = a[at(j, j)];
-    inverse[j] = pivot > no_pivot * most ? 1.0 / pivot : 0.0;
-    for (int i = j + 1; i < 6; ++i) {
-      const double factor = inverse[j] * a[at(i, j)];
-      for (int k = i; k < 6; ++k) a[at(k, i)] = subtract_product(a[at(k, i)], factor, a[at(k, j)]);
-      b[i] = subtract_product(b[i], factor, b[j]);
+// A symmetric 6 x 6 matrix, by its lower triangle, and as row 6 a right side; on one thread.
+class CoarseTerms {
+ public:
+  static constexpr int count = 27;
+  PD_HD static constexpr int at(int row, int column) { return row * (row + 1) / 2 + column; }
+
+  // entry = of(number, row, column, entry)
+  template <class Of>
+  PD_HD void set(const Of& of) {
+    for (int r = 0, n = 0; r <= 6; ++r)
+      for (int c = 0; c <= r && c < 6; ++c, ++n) entry_[n] = of(n, r, c, entry_[n]);
+  }
+
+  // sum of of(row, column, entry)
+  template <class Of>
+  PD_HD double sum(const Of& of) const {
+    double sum = 0;
+    for (int r = 0, n = 0; r <= 6; ++r)
+      for (int c = 0; c <= r && c < 6; ++c, ++n) sum = sum + of(r, c, entry_[n]);
+    return sum;
+  }
+
+  // x with A x = b for an A that is not negative, 0 along rows without pivot: A = L D L^T. Entries are lost.
+  PD_HD void solve(double (&x)[6]) {
+    double most = 0, inverse[6];
+    for (int i = 0; i < 6; ++i) most = entry_[at(i, i)] > most ? entry_[at(i, i)] : most;
+    for (int j = 0; j < 6; ++j) {
+      const double pivot = entry_[at(j, j)];
+      inverse[j] = pivot > no_pivot * most ? 1.0 / pivot : 0.0;
+      for (int c = j + 1; c < 6; ++c) {
+        const double factor = inverse[j] * entry_[at(c, j)];
+        for (int r = c; r <= 6; ++r)
+          entry_[at(r, c)] = subtract_product(entry_[at(r, c)], factor, entry_[at(r, j)]);
+      }
+    }
+    for (int j = 5; j >= 0; --j) {
+      x[j] = inverse[j] * entry_[at(6, j)];
+      for (int c = 0; c < j; ++c)
+        entry_[at(6, c)] = subtract_product(entry_[at(6, c)], entry_[at(j, c)], x[j]);
     }
   }
-  for (int i = 5; i >= 0; --i) {
-    double sum = b[i];
-    for (int k = i + 1; k < 6; ++k) sum = subtract_product(sum, a[at(k, i)], b[k]);
-    b[i] = inverse[i] * sum;
-  }
-}
 
-// The passes of one body.
+ private:
+  double entry_[count] = {};
+};
+
+// The passes of one body. `Terms`: CoarseTerms, or the same of a group of threads that all call with equal arguments.
 class CoarseBody {
  public:
   CoarseBody() = default;
@@ -92,24 +116,31 @@ class CoarseBody {
             trial_.shift,   finite_ ? 1.0 : 0.0, renews_ ? 1.0 : 0.0};
   }
 
-  // All passes of a body without contacts.
+  // All passes of a body without contacts: there the first order is exact.
+  template <class Terms = CoarseTerms>
   PD_HD void move_free() {
     const double none[ContactSums::count] = {};
-    while (!done_) pass(none);
-  }
-
-  PD_COLD void pass(const double (&sum)[ContactSums::count]) {
-    if (finite_) {
-      end_motion(sum);
-    } else if (renews_) {
-      renews_ = false;
-      next_step(sum);
-    } else {
-      go_on(sum);
+    while (!done_) {
+      if (end_motion(none) == Next::step) {
+        begin_step<Terms>(none);
+        for (int i = 0; i < 6; ++i) twist_[i] = step_[i];
+      }
+      try_motion();
     }
   }
 
+  template <class Terms = CoarseTerms>
+  PD_HD void pass(const double (&sum)[ContactSums::count]) {
+    const Next next = finite_ ? end_motion(sum) : renews_ ? renewed() : go_on<Terms>(sum);
+    if (next == Next::step) begin_step<Terms>(sum);
+    if (next == Next::step || next == Next::search) try_step();
+    if (next == Next::motion) try_motion();
+  }
+
  private:
+  // What follows a pass: nothing, or a new step, one that is shortened, or a finite motion.
+  enum class Next { none, step, search, motion };
+
   // Of the quadratics, relative to no motion.
   PD_HD double energy(const RigidMotion<double>& motion) const {
     return 0.5 * body_.weight * dot(motion.shift, motion.shift) - dot(motion.shift, body_.pull) -
@@ -117,48 +148,47 @@ class CoarseBody {
   }
 
   // After the pass of a finite motion: accepts it, or halves its twist.
-  PD_HD void end_motion(const double (&sum)[ContactSums::count]) {
+  PD_HD Next end_motion(const double (&sum)[ContactSums::count]) {
     using S = ContactSums;
     const double before = energy(accepted_) + sum[S::before],
                  after = energy(trial_) + sum[S::after];
     if (!(after <= before + energy_rounding * (body_.weight * body_.square + sum[S::before]))) {
       done_ = ++cuts_ > most_cuts;
       for (double& number : twist_) number *= 0.5;
-      if (!done_) try_motion();
-      return;
+      return done_ ? Next::none : Next::motion;
     }
     accepted_ = trial_;
     contact_energy_ = sum[S::after];
     cuts_ = 0;
     done_ = (motions_ > 0 && length_of(twist_) <= still_share * size_) || ++motions_ > most_motions;
-    if (done_) return;
+    if (done_) return Next::none;
     find_quadratics();
     for (double& number : twist_) number = 0;
     steps_ = 0;
-    finite_ = false;
-    begin_step(sum);
+    return Next::step;
   }
 
   // After a pass to first order: ends the step, or goes on to where Phi is least along it.
-  PD_HD void go_on(const double (&sum)[ContactSums::count]) {
+  template <class Terms>
+  PD_HD Next go_on(const double (&sum)[ContactSums::count]) {
     using S = ContactSums;
-    double at[6], force[6], matrix[21], slope = 0, second = 0;
+    double at[6];
     for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
-    find_terms(at, sum, force, matrix);
-    for (int i = 0; i < 6; ++i) {
-      slope -= force[i] * step_[i];
-      for (int j = 0; j <= i; ++j)
-        second += (i == j ? 1.0 : 2.0) * step_[i] * step_[j] * matrix[i * (i + 1) / 2 + j];
-    }
+    const Terms terms = terms_at<Terms>(at, sum);
+    const double slope = -terms.sum(
+        [&](int r, int c, double entry) { return r < 6 ? 0.0 : entry * pick(step_, c); });
+    const double second = terms.sum([&](int r, int c, double entry) {
+      return r < 6 ? (r == c ? 1.0 : 2.0) * entry * (pick(step_, r) * pick(step_, c)) : 0.0;
+    });
     // the slope rises: Newton's step within the bracket, or its middle
     (slope < 0 ? low_ : high_) = share_;
     double next = share_ - slope / second;
-    if (!(low_ < next && next < high_)) next = 0.5 * (low_ + high_);
+    if (next != share_ && !(low_ < next && next < high_)) next = 0.5 * (low_ + high_);
     const bool ends = (share_ == 1.0 && !(slope > 0)) ||
                       absolute(next - share_) * length_of(step_) <= exact_share * size_;
     if (!ends && ++searches_ <= most_searches) {
       share_ = next;
-      return try_step();
+      return Next::search;
     }
     for (int i = 0; i < 6; ++i) twist_[i] = at[i];
     ++steps_;
@@ -168,21 +198,28 @@ class CoarseBody {
     const bool near = way_ <= small;
     ends_ = (near && lag <= settled_share * settled_share * radius) || steps_ >= most_steps;
     renews_ = near && lag > still_share * still_share * radius;
-    if (!renews_) next_step(sum);
+    return renews_ ? Next::none : ends_ ? Next::motion : Next::step;
   }
 
-  PD_HD void next_step(const double (&sum)[ContactSums::count]) {
-    ends_ ? try_motion() : begin_step(sum);
+  // After a pass that has renewed radii.
+  PD_HD Next renewed() {
+    renews_ = false;
+    return ends_ ? Next::motion : Next::step;
   }
 
+  template <class Terms>
   PD_HD void begin_step(const double (&sum)[ContactSums::count]) {
-    double matrix[21], force[6];
-    find_terms(twist_, sum, force, matrix);
-    for (int i = 0; i < 6; ++i) step_[i] = force[i];
-    solve_6x6(matrix, step_);
+    Terms terms = terms_at<Terms>(twist_, sum);
+    terms.solve(step_);
     searches_ = 0;
     low_ = 0, high_ = share_ = 1;
-    try_step();
+  }
+
+  // entry n of a vector; a group of threads has different n, and keeps the vector in registers
+  PD_HD static double pick(const double (&from)[6], int n) {
+    double entry = from[0];
+    for (int i = 1; i < 6; ++i) entry = n == i ? from[i] : entry;
+    return entry;
   }
 
   PD_HD static double length_of(const double (&twist)[6]) {
@@ -192,23 +229,26 @@ class CoarseBody {
 
   // The trial to first order: the twist and the step.
   PD_HD void try_step() {
+    finite_ = false;
     way_ = share_ * length_of(step_);
     double at[6];
     for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
-    const Vec3<double> shift = {at[0], at[1], at[2]}, turn = {at[3], at[4], at[5]};
-    const Mat3<double> more = cross_matrix(length_ * turn), product = more * accepted_.turn;
-    trial_.shift = accepted_.shift + shift;
-    for (int r = 0; r < 3; ++r)
-      trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
+    set_trial(at, cross_matrix(turn_of(at)));
   }
 
   // The finite trial.
   PD_HD void try_motion() {
     finite_ = true;
-    const Vec3<double> shift = {twist_[0], twist_[1], twist_[2]},
-                       turn = {twist_[3], twist_[4], twist_[5]};
-    const Mat3<double> more = small_turn(length_ * turn), product = more * accepted_.turn;
-    trial_.shift = accepted_.shift + shift;
+    set_trial(twist_, small_turn(turn_of(twist_)));
+  }
+
+  PD_HD Vec3<double> turn_of(const double (&twist)[6]) const {
+    return length_ * Vec3<double>{twist[3], twist[4], twist[5]};
+  }
+
+  PD_HD void set_trial(const double (&twist)[6], const Mat3<double>& more) {
+    const Mat3<double> product = more * accepted_.turn;
+    trial_.shift = accepted_.shift + Vec3<double>{twist[0], twist[1], twist[2]};
     for (int r = 0; r < 3; ++r)
       trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
   }
@@ -234,49 +274,42 @@ class CoarseBody {
     moment_ = length_ * axis_of(covariance);
   }
 
-  // Minus the first derivative of Phi to first order at a twist, and the second, by its lower triangle.
-  PD_HD void find_terms(const double (&at)[6], const double (&sum)[ContactSums::count],
-                        double (&force)[6], double (&matrix)[21]) const {
-    using S = ContactSums;
+  // Of Phi to first order at a twist: the second derivative, and minus the first.
+  template <class Terms>
+  PD_HD Terms terms_at(const double (&at)[6], const double (&sum)[ContactSums::count]) const {
     const Vec3<double> shift = {at[0], at[1], at[2]}, turn = {at[3], at[4], at[5]};
     const Vec3<double> f = subtract_product(force_, body_.weight, shift),
                        m = moment_ - second_ * turn;
-    const double own[6] = {f.x, f.y, f.z, m.x, m.y, m.z};
-    const double rows[3][3] = {{second_.row[0].x, second_.row[0].y, second_.row[0].z},
-                               {second_.row[1].x, second_.row[1].y, second_.row[1].z},
-                               {second_.row[2].x, second_.row[2].y, second_.row[2].z}};
-    for (int i = 0; i < 6; ++i) {
-      const double scale = i < 3 ? 1.0 : length_;
-      force[i] = multiply_add(scale, sum[S::force + i], own[i]);
-      for (int j = 0; j <= i; ++j)
-        matrix[i * (i + 1) / 2 + j] =
-            multiply_add(scale * (j < 3 ? 1.0 : length_), sum[S::at(i, j)],
-                         i < 3   ? (i == j ? body_.weight : 0.0)
-                         : j < 3 ? 0.0
-                                 : rows[i - 3][j - 3]);
-    }
-    if (body_.hold != Hold::none) keep_to_pins(matrix, force);
+    const double force[6] = {f.x, f.y, f.z, m.x, m.y, m.z};
+    const double turns[6] = {second_.row[0].x, second_.row[1].x, second_.row[1].y,
+                             second_.row[2].x, second_.row[2].y, second_.row[2].z};
+    Terms terms;
+    terms.set([&](int n, int r, int c, double) {
+      const double own = r == 6  ? pick(force, c)
+                         : r < 3 ? (r == c ? body_.weight : 0.0)
+                         : c < 3 ? 0.0
+                                 : pick(turns, Terms::at(r - 3, c - 3));
+      const double scale = (r < 3 || r == 6 ? 1.0 : length_) * (c < 3 ? 1.0 : length_);
+      return multiply_add(scale, sum[ContactSums::matrix + n], own);
+    });
+    if (body_.hold != Hold::none) keep_to_pins(terms);
+    return terms;
   }
 
   // Pins leave no shift; along a line they leave the turn about it.
-  PD_HD void keep_to_pins(double (&matrix)[21], double (&step)[6]) const {
-    const auto entry = [&](int i, int j) -> double& { return matrix[i * (i + 1) / 2 + j]; };
-    for (int i = 0; i < 6; ++i) {
-      for (int j = 0; j < 3 && j <= i; ++j) entry(i, j) = 0;
-      if (i < 3) step[i] = 0;
-    }
-    if (body_.hold != Hold::line) return;
-    const double n[3] = {body_.axis.x, body_.axis.y, body_.axis.z};
-    double along = 0, force = 0;
-    for (int i = 0; i < 3; ++i) {
-      force += n[i] * step[3 + i];
-      for (int j = 0; j < 3; ++j)
-        along += n[i] * n[j] * (i > j ? entry(3 + i, 3 + j) : entry(3 + j, 3 + i));
-    }
-    for (int i = 0; i < 3; ++i) {
-      step[3 + i] = force * n[i];
-      for (int j = 0; j <= i; ++j) entry(3 + i, 3 + j) = along * ((i == j ? 1.0 : 0.0));
-    }
+  template <class Terms>
+  PD_HD void keep_to_pins(Terms& terms) const {
+    const bool line = body_.hold == Hold::line;
+    const double axis[6] = {0, 0, 0, body_.axis.x, body_.axis.y, body_.axis.z};
+    const double along = terms.sum([&](int r, int c, double entry) {
+      return r < 6 ? (r == c ? 1.0 : 2.0) * entry * (pick(axis, r) * pick(axis, c)) : 0.0;
+    });
+    const double force =
+        terms.sum([&](int r, int c, double entry) { return r == 6 ? entry * pick(axis, c) : 0.0; });
+    terms.set([&](int, int r, int c, double entry) {
+      if (c < 3 || !line) return c < 3 ? 0.0 : entry;
+      return r == 6 ? force * pick(axis, c) : r == c ? along : 0.0;
+    });
   }
 
   RigidBody body_;
