@@ -35,7 +35,7 @@ inline const int32* sizes_view(const Tensor& t, std::int64_t count) {
 
 // Lengths of the arrays, by the names in cpu_plan.def.
 struct PlanRows {
-  std::int64_t size, vertex, component, pin, block, patch_end, slot, shared_end, shared_slot;
+  std::int64_t size, vertex, pin, block, patch_end, slot, shared_end, shared_slot;
 };
 
 #define X(name, type, width, rows, meaning) +1
@@ -178,6 +178,7 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.tets = size[plan_tets];
   plan.pins = size[plan_pins];
   plan.components = size[plan_components];
+  plan.solid_components = size[plan_solid_components];
   plan.blocks = size[plan_blocks];
   plan.patches = size[plan_patches];
   plan.slots = size[plan_slots];
@@ -192,7 +193,6 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   PlanRows count{};
   count.size = plan_size_count;
   count.vertex = plan.vertices;
-  count.component = plan.components;
   count.pin = plan.pins;
   count.block = plan.blocks;
   count.patch_end = plan.patches + 1;

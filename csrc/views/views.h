@@ -16,6 +16,7 @@ enum PlanSize : int {
   plan_tets,
   plan_pins,
   plan_components,
+  plan_solid_components,
   plan_blocks,
   plan_patches,
   plan_slots,
@@ -101,8 +102,8 @@ struct Plan {
 #include "views/cpu_plan.def"
 #include "views/cpu_stencils.def"
 #undef X
-  int vertices = 0, tets = 0, pins = 0, components = 0, blocks = 0, patches = 0, slots = 0,
-      shared = 0;
+  int vertices = 0, tets = 0, pins = 0, components = 0, solid_components = 0, blocks = 0,
+      patches = 0, slots = 0, shared = 0;
   int most_slots = 0;  // of any patch
   int members = 1;     // tetrahedra of a group that averages its trace: 1, 2 or 4
   int stencil_blocks = 0,

@@ -327,7 +327,7 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
-    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island, and these changes.
+    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection, and these changes.
 
     A vertex that touches several planes and spheres is pushed by one after another.
     """

@@ -1,4 +1,4 @@
-"""The minimisation of one time step: its objective (`reference.objective`), its first iterate, and energies of a scene."""
+"""The minimisation of one time step, on `reference.objective`: its first iterate, and energies of a scene."""
 
 from __future__ import annotations
 

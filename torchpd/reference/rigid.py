@@ -30,12 +30,13 @@ def corrected(
 
 
 def first_iterate(problem: Objective, guess: Array) -> Array:
-    """u_0 [V, 3] m: every body in its present shape, or at a guess [V, 3] m if that has the lower energy.
+    """u_0 [V, 3] m: every solid in its present shape, or at a guess [V, 3] m if that has the lower energy.
 
+    Cloth and rods take the guess: their energy is that of stretches, which iterations remove before anything else.
     Both are corrected. The energy is Phi less |f0|^2 / (2 D). Elastic energies differ by the work of the mean elastic
     force, to third order: internal forces have no torque, so rigid motions do not change it. For the present shape,
-    contacts answer the elastic forces alone. Phi has no work of the pushes on the inertia that f0 does not answer: all of
-    it there, what the correction has changed at the guess.
+    contacts answer the elastic forces alone. Phi has no work of the pushes on the inertia that f0 does not answer: all
+    of it there, what the correction has changed at the guess.
     """
     states = [problem.project(problem.hold(u)) for u in (np.zeros_like(guess), guess)]
     gradients = [problem.gradient(u) for u in states]
@@ -52,5 +53,6 @@ def first_iterate(problem: Objective, guess: Array) -> Array:
         work = work + sign * (inertia * after.pushes).sum(axis=1)
     component = problem.values.component
     # clamped bodies have no Phi, and take the guess
-    lower = ~(moved.energies + np.bincount(component, work) >= kept.energies) | np.isinf(kept.energies)
+    stays = problem.values.solid & np.isfinite(kept.energies)
+    lower = ~stays | ~(moved.energies + np.bincount(component, work) >= kept.energies)
     return np.where(lower[component, None], moved.displacement, kept.displacement)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,18 @@ class SceneValues:
     stiffness_damping: Array | None = None  # [E] s, None where no solid has any
     pressure: Array | None = None  # [pressures] Pa, None without any
     wind: Array | None = None  # [3] m/s, None without
+
+    @cached_property
+    def solid(self) -> NDArray[np.bool_]:
+        """Whether all vertices of each component [components] are corners of tetrahedra."""
+        inside = np.zeros(len(self.component), np.bool_)
+        inside[self.tets] = True
+        for group in self.stencils:
+            if group.gradients.shape[2] == 3:  # F maps space
+                inside[group.corners] = True
+        solid = np.ones(len(self.loose), np.bool_)
+        solid[self.component[~inside]] = False
+        return solid
 
 
 def _no_part(part: object) -> TypeError:

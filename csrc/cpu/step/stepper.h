@@ -80,18 +80,22 @@ class Stepper {
     team_.barrier();
   }
 
-  // The coarse correction: every body that pins leave free takes the rigid motion with the least energy. The first one
-  // chooses between two iterates: the present shape, and the guess.
+  // The coarse correction: every body that pins leave free takes the rigid motion with the least energy. Before the
+  // iterations a solid one chooses between two iterates: the present shape, and the guess.
   void align() {
     const bool first = !started_;
     started_ = true;
     if (plan_.components == 0 || (first && set_.start() == StartKind::given)) return;
-    if (first) return choose_first_iterate();
+    if (first && plan_.solid_components > 0) return choose_first_iterate();
     if constexpr (HasContacts) {
       each_elastic_force(
           [&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force, Wide(1.0)); });
     }
     correct();
+    if (first) {
+      each_that_moves([&](std::int64_t i) { w_.before[i] = w_.u[i]; });
+      team_.barrier();
+    }
   }
 
   // The guess that the first iterate is made from.
@@ -228,9 +232,11 @@ class Stepper {
     if (team_.rank == 0) sum_rises();
     team_.barrier();
     each_that_moves([&](std::int64_t i) {
-      const BodySums<Wide>& body = w_.body_sums[plan_.vertex_component[i]];
-      const auto stays =
-          Lanes::narrow(body.moves) > Real(T(0)) && !(Lanes::narrow(body.rise) < Real(T(0)));
+      const int g = plan_.vertex_component[i];
+      const BodySums<Wide>& body = w_.body_sums[g];
+      const Real none(T(0)),
+          moves = Real(T(g < plan_.solid_components ? 1 : 0)) * Lanes::narrow(body.moves);
+      const auto stays = moves > none && !(Lanes::narrow(body.rise) < none);
       w_.u[i] = w_.before[i] = select(stays, w_.before[i], w_.u[i]);
     });
     team_.barrier();

@@ -103,9 +103,10 @@ template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InSha
           bool HasStencils>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
                            HasStencils>::correct_pieces(bool first) {
-  if (first) take_present_shape();
+  const bool both = first && plan_.solid_pieces > 0;
+  if (both) take_present_shape();
 #pragma unroll 1
-  for (int n = 0; n <= int(first); ++n) {
+  for (int n = both ? 0 : 1; n < 2; ++n) {
     const Iterate from = iterate_of(n, first);
     // a kernel for contacts may serve a scene without
     if (first || contacts_.exist()) keep_forces(from);

@@ -8,13 +8,14 @@
 namespace pd::inline PD_TARGET {
 
 // The iterate that a correction begins from: the last one, or before any iteration one of the two
-// first ones. The present shape is corrected first, then the guess, and the one of less energy stays.
+// first ones. The present shape is corrected first, if a piece is solid, and then the guess. Of a solid
+// piece the one of less energy stays.
 enum class Iterate : int { last, present, guess };
 
-// The n-th correction of a step's start (`first`) or end.
+// The second correction of a step's start (`first`), the only one of its end, or that before.
 PD_DEVICE Iterate iterate_of(int n, bool first) {
-  if (!first) return Iterate::last;
-  return n == 0 ? Iterate::present : Iterate::guess;
+  if (n == 0) return Iterate::present;
+  return first ? Iterate::guess : Iterate::last;
 }
 
 // Reads past the L1 cache, which may not hold the writes of other blocks.

@@ -233,7 +233,8 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_co
     of_the_warp(to.body, [&](CoarseBody& body) { body.pass<WarpTerms>(to.contact); });
   } else {
     sum_over_parts<1>(plan, piece, part_sum, 0, &to.rise);
-    if (leader) to.rise += to.body.reached() - to.reached;
+    if (leader)
+      to.rise = piece < plan.solid_pieces ? to.rise + (to.body.reached() - to.reached) : -1;
   }
 }
 

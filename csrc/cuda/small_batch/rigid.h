@@ -41,13 +41,14 @@ template <class T, bool HasContacts, bool HasFreePieces, bool OnePerThread, bool
 PD_DEVICE void SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread,
                                 FewRegisters>::correct_pieces(bool first) {
   prefetch_pair(first_pair_);
-  if (first) {
+  const bool both = first && plan_.solid_pieces > 0;
+  if (both) {
     each_slot_of_a_piece([&](const WorkItem& item, int i, const Piece&) {
       move(i, correction(item.environment, Iterate::present).present(i));
     });
   }
 #pragma unroll 1
-  for (int n = 0; n <= int(first); ++n) {
+  for (int n = both ? 0 : 1; n < 2; ++n) {
     const Iterate from = iterate_of(n, first);
     if (HasContacts || first) keep_forces(from);
     Rounds rounds{*this, from};

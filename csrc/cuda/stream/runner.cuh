@@ -140,6 +140,7 @@ class StreamRunner {
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
     if (!first) return correct(Iterate::last);
+    if (plan_.solid_pieces == 0) return correct(Iterate::guess);
     constexpr int per_block = rounds_threads / warp_size;
     const std::int64_t parts = call_.step.batch * plan_.parts;
     launcher_.run(stream_present<T, HasContacts>, (parts + per_block - 1) / per_block,
