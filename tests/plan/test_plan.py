@@ -231,8 +231,8 @@ def test_plan_to_keeps_integers(plan: Plan) -> None:
 def test_sizes_count_what_the_arrays_hold(plan: Plan, values: SceneValues) -> None:
     slots = plan.patch_slot.diff()
     assert plan.sizes.tolist() == [
-        len(values.rest_positions), len(values.tets), len(values.pin_vertices), *(2 * [int(plan.vertex_component.max()) + 1]),
-        len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
+        len(values.rest_positions), len(values.tets), len(values.pin_vertices),
+        *(2 * [int(plan.vertex_component.max()) + 1]), len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
         plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()), 1,
     ]  # fmt: skip
 
