@@ -70,6 +70,16 @@ def first_of(problem: StepProblem, case: Case, solver: pd.Jacobi | pd.Chebyshev)
     return problem.with_diagonal(weighted=solver.settings()["weighted"]).first_iterate(case.start)
 
 
+def ended_by_rounding(problem: StepProblem, displacement: Array) -> float:
+    """How far rounding may move an iterate, relative to it, where contacts touch.
+
+    Coarse corrections with friction converge linearly, and end at 1e-7 of the size: rounding may add one more step.
+    """
+    size = float(np.ptp(problem.positions, axis=0).max())
+    contacts = len(problem.values.planes) + len(problem.values.spheres)
+    return 1e-7 * size / float(np.abs(displacement).max()) if contacts else 0.0
+
+
 def reference_run(
     problem: StepProblem,
     first: Array,

@@ -12,6 +12,7 @@ from iterate_cases import CASES, RESTARTS, SOLVERS, restarting
 from runs import (
     arguments_of,
     displacement,
+    ended_by_rounding,
     first_of,
     reference_runs,
     residual_error,
@@ -39,14 +40,8 @@ DIVERGED = 100.0
 
 
 def tolerance_of(problem: StepProblem, displacement: Array, dtype: torch.dtype) -> float:
-    """The bound, relative to the displacement.
-
-    Newton's steps on contacts with friction converge linearly, and end at 1e-7 of the size: rounding may add one more.
-    """
-    contacts = len(problem.values.planes) + len(problem.values.spheres)
-    size = float(np.ptp(problem.positions, axis=0).max())
-    ended = 1e-7 * size / float(np.abs(displacement).max()) if contacts else 0.0
-    return max(TOLERANCE[dtype], ended)
+    """The bound, relative to the displacement."""
+    return max(TOLERANCE[dtype], ended_by_rounding(problem, displacement))
 
 
 @pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
