@@ -16,13 +16,13 @@ enum PlanSize : int {
   plan_tets,
   plan_pins,
   plan_components,
-  plan_solid_components,
   plan_blocks,
   plan_patches,
   plan_slots,
   plan_shared,
   plan_most_slots,
   plan_members,
+  plan_solid_components,
   plan_size_count
 };
 

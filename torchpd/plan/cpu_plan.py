@@ -37,7 +37,7 @@ Reals = NDArray[np.float64]
 _WORTH_A_BAR = 200_000  # tetrahedra from which a progress bar is shown
 # in the order of their numbers in the `sizes` of a GPU plan
 KERNELS = ("block", "cluster", "grid", "stream")
-_SIZE_COMPONENTS = 3  # place in PlanSize of csrc/views/views.h; that of the solid ones follows
+_SIZE_COMPONENTS, _SIZE_SOLID = 3, 10  # places in PlanSize of csrc/views/views.h
 
 
 def kernel_of(arrays: Sequence[Tensor]) -> str:
@@ -189,7 +189,7 @@ def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
         raise ValueError("with_loose_components: plan must be a CPU plan, got a GPU plan; compile it again")
     group, *counts = loose_pieces(values)
     sizes = plan.sizes.clone()
-    sizes[_SIZE_COMPONENTS : _SIZE_COMPONENTS + 2] = torch.tensor(counts)
+    sizes[_SIZE_COMPONENTS], sizes[_SIZE_SOLID] = counts
     new = {"vertex_component": tensor_of(group)[plan.vertex_order.long()], "sizes": sizes}
     arrays = tuple(new.get(row.name, array) for row, array in zip(plan.table, plan.arrays, strict=True))
     return replace(plan, arrays=arrays, loose=values.loose)

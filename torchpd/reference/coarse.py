@@ -39,8 +39,9 @@ OUTER = 6  # finite motions
 PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-STILL = 1e-7  # of the size of a body, and of the friction radii: a motion that ends the passes, and a lag that is none
-SETTLED = 0.1  # of a motion: a step after which friction radii become friction l; of these: a lag that ends the steps
+STILL = 1e-7  # of the size of a body: a motion that ends the passes
+LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
+SETTLED = 0.1  # of a motion: a step after which friction radii follow; of these: a lag that ends the steps
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
@@ -274,7 +275,8 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
             break
         share = motions.share(motion)
         motions, contacts, phi = trial, after, reached
-        if share <= STILL:
+        lag = contacts.friction * contacts.normal_forces() - radius
+        if share <= STILL and np.linalg.norm(lag) <= LAG * np.linalg.norm(radius):
             break
     return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
@@ -282,8 +284,8 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
 def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
-    Newton's steps, each ended where the model is least along it. Radii become friction l after one that is small beside
-    the motion.
+    Newton's steps, each ended where the model is least along it. Radii go half way to friction l after one that is small
+    beside the motion: all the way, what friction does to normal forces may drive them up and down.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -319,8 +321,8 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
         if share > max(STILL, SETTLED * motions.share(motion)):
             continue
         behind, size = np.linalg.norm(lag), np.linalg.norm(radius)
-        if behind > STILL * size:
-            radius = radius + lag
+        if behind > 0.1 * LAG * size:
+            radius = radius + 0.5 * lag
         if behind <= SETTLED * size:
             break
     return motion, radius

@@ -210,12 +210,12 @@ PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
 }
 
 // What a round asks of a body's vertices, per environment: the accepted motion and the trial, a finite motion, or to first
-// order a twist about the moved centre. `renews`: whether radii become friction l.
+// order a twist about the moved centre. `renews`: the share by which radii move toward friction l.
 template <class W>
 struct CoarseTrial {
   Mat3<W> turn_before, turn_after;  // R - I; to first order [w]x R
   Vec3<W> center, shift_before, shift_after;
-  W finite, renews;  // 1 or 0
+  W finite, renews;  // 1 or 0; 0.5 or 0
 };
 
 // Adds the contacts of a vertex. `forces[n stride]`: ContactForce of contact n.

@@ -2,7 +2,7 @@
 // (solver/coarse/envelope.h).
 //
 // Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each
-// ended where Phi is least along it. After one that is small beside the motion, radii of friction become friction times l. The
+// ended where Phi is least along it. After one that is small beside the motion, radii of friction go half way to friction times l. The
 // motion is halved until Phi itself has not risen. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
@@ -20,8 +20,8 @@ struct RigidMotion {
 };
 
 constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 30;
-// Of the size of a body, and of the radii: a motion that ends the passes, and a lag that is none.
-constexpr double still_share = 1e-7;
+// Of the size of a body: a motion that ends the passes. Of the radii: how far behind friction l they may be left.
+constexpr double still_share = 1e-7, lag_share = 1e-6;
 // Of a motion: a step after which radii are renewed. Of these: a lag that ends the steps.
 constexpr double settled_share = 0.1;
 // Of the energy that moves a body by its size: a rise that is rounding.
@@ -113,7 +113,7 @@ class CoarseBody {
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
     return {accepted_.turn, trial_.turn,         body_.center,       accepted_.shift,
-            trial_.shift,   finite_ ? 1.0 : 0.0, renews_ ? 1.0 : 0.0};
+            trial_.shift,   finite_ ? 1.0 : 0.0, renews_ ? 0.5 : 0.0};
   }
 
   // All passes of a body without contacts: there the first order is exact.
@@ -160,7 +160,9 @@ class CoarseBody {
     accepted_ = trial_;
     contact_energy_ = sum[S::after];
     cuts_ = 0;
-    done_ = (motions_ > 0 && length_of(twist_) <= still_share * size_) || ++motions_ > most_motions;
+    const bool still = length_of(twist_) <= still_share * size_ &&
+                       sum[S::lag] <= lag_share * lag_share * sum[S::radius];
+    done_ = (motions_ > 0 && still) || ++motions_ > most_motions;
     if (done_) return Next::none;
     find_quadratics();
     for (double& number : twist_) number = 0;
@@ -197,7 +199,7 @@ class CoarseBody {
     const double small = least > share ? least : share;
     const bool near = way_ <= small;
     ends_ = (near && lag <= settled_share * settled_share * radius) || steps_ >= most_steps;
-    renews_ = near && lag > still_share * still_share * radius;
+    renews_ = near && lag > 0.01 * lag_share * lag_share * radius;
     return renews_ ? Next::none : ends_ ? Next::motion : Next::step;
   }
 
