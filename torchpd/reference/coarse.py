@@ -321,7 +321,7 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
         if share > max(STILL, SETTLED * motions.share(motion)):
             continue
         behind, size = np.linalg.norm(lag), np.linalg.norm(radius)
-        if behind > 0.1 * LAG * size:
+        if behind > LAG * size:
             radius = radius + 0.5 * lag
         if behind <= SETTLED * size:
             break

@@ -199,7 +199,7 @@ class CoarseBody {
     const double small = least > share ? least : share;
     const bool near = way_ <= small;
     ends_ = (near && lag <= settled_share * settled_share * radius) || steps_ >= most_steps;
-    renews_ = near && lag > 0.01 * lag_share * lag_share * radius;
+    renews_ = near && lag > lag_share * lag_share * radius;
     return renews_ ? Next::none : ends_ ? Next::motion : Next::step;
   }
 
