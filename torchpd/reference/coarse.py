@@ -41,6 +41,7 @@ CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
 STILL = 1e-7  # of the size of a body: a motion that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
+EARLY = 1e-3  # both, before the iterations
 SETTLED = 0.1  # of a motion: a step after which friction radii follow; of these: a lag that ends the steps
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
@@ -219,6 +220,7 @@ def correct(
     pairs: PairContacts | None = None,
     *,
     motions: MotionsOf = RigidMotions,
+    early: bool = False,
 ) -> Correction:
     """The coarse correction of every island.
 
@@ -228,6 +230,7 @@ def correct(
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
         motions: makes the motions of an island.
+        early: whether iterations go on from it, so that it may end sooner.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
     energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
@@ -235,7 +238,7 @@ def correct(
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, push, each, energy = _correct_island(moving, forces, own)
+        corrected, push, each, energy = _correct_island(moving, forces, own, early)
         pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
         energies[problem.values.component[[body[0] for body in bodies]]] = energy
@@ -255,13 +258,16 @@ def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[t
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, Array, float]:
+def _correct_island(
+    motions: Motions, forces: Array, pairs: PairContacts | None, early: bool
+) -> tuple[Array, Array, Array, float]:
     """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
+    still, behind = (EARLY, EARLY) if early else (STILL, LAG)
     for _ in range(OUTER):
-        motion, radius = _model_minimum(motions, contacts, radius)
+        motion, radius = _model_minimum(motions, contacts, radius, still, behind)
         phi = energy = motions.energy + contacts.energy(radius)
         for _ in range(CUTS + 1):
             trial = motions.after(motion)
@@ -276,16 +282,18 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
         share = motions.share(motion)
         motions, contacts, phi = trial, after, reached
         lag = contacts.friction * contacts.normal_forces() - radius
-        if share <= STILL and np.linalg.norm(lag) <= LAG * np.linalg.norm(radius):
+        if share <= still and np.linalg.norm(lag) <= behind * np.linalg.norm(radius):
             break
     return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
-def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+def _model_minimum(
+    motions: Motions, contacts: Envelopes, radius: Array, still: float, behind: float
+) -> tuple[Array, Array]:
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
-    Newton's steps, each ended where the model is least along it. Radii go half way to friction l after one that is small
-    beside the motion: all the way, what friction does to normal forces may drive them up and down.
+    Newton's steps, each ended where the model is least along it. Radii go half way to friction l after one that is
+    small beside the motion: all the way, what friction does to normal forces may drive them up and down.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -318,12 +326,12 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
                 low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
         motion, share = motion + high * step, motions.share(high * step)
         lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
-        if share > max(STILL, SETTLED * motions.share(motion)):
+        if share > max(still, SETTLED * motions.share(motion)):
             continue
-        behind, size = np.linalg.norm(lag), np.linalg.norm(radius)
-        if behind > LAG * size:
+        left, size = np.linalg.norm(lag), np.linalg.norm(radius)
+        if left > behind * size:
             radius = radius + 0.5 * lag
-        if behind <= SETTLED * size:
+        if left <= SETTLED * size:
             break
     return motion, radius
 

@@ -121,17 +121,17 @@ bool set_trial(Workspace<Lanes>& w, int g) {
   return goes_on;
 }
 
-// Motions of all bodies.
+// Motions of all bodies. `early`: before the iterations.
 template <bool HasContacts, class Lanes>
 void find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
-                  const Contacts<typename Lanes::Real>& contacts) {
+                  const Contacts<typename Lanes::Real>& contacts, bool early) {
   using Wide = typename Lanes::Wide;
   constexpr int lanes = Lanes::environments;
   sum_bodies(plan, w);
   for (int n = 0; n < plan.components * lanes; ++n) {
     double sum[RigidSums::count];
     read_lane<RigidSums::count, Lanes>(w.body_sums[n / lanes].rigid, n % lanes, sum);
-    w.bodies[n] = CoarseBody(RigidBody(sum));
+    w.bodies[n] = CoarseBody(RigidBody(sum), early);
     put_lane<Lanes>(w.body_sums[n / lanes].moves, n % lanes, w.bodies[n].moves() ? 1.0 : 0.0);
     if constexpr (!HasContacts) w.bodies[n].move_free();
   }

@@ -37,7 +37,7 @@ class FusedRounds {
     }
     sums.sync();
     for (int n = warp; n < plan.pieces; n += warps)
-      move_piece<What>(plan, n, of.contacts.exist(), part_sums, pieces[n]);
+      move_piece<What>(plan, n, of.contacts.exist(), of.is_early(), part_sums, pieces[n]);
     __syncthreads();
   }
 

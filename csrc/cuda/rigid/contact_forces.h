@@ -88,6 +88,7 @@ struct Correction {
   ContactForces<T> forces;
   Iterate from;
 
+  PD_DEVICE bool is_early() const { return from != Iterate::last; }
   PD_DEVICE Vec3<T> present(int i) const { return v.at(i).current_iterate(contacts); }
   PD_DEVICE Vec3<T> guess(int i, int vertex) const { return v.first(i, in, vertex, contacts); }
 

@@ -206,9 +206,9 @@ PD_DEVICE void of_the_warp(CoarseBody& body, const Change& change) {
   __syncwarp();
 }
 
-// `part_sum`: [parts, PartSums::count]. A warp for a piece.
+// `part_sum`: [parts, PartSums::count]. A warp for a piece. `early`: before the iterations.
 template <Round What, class T>
-PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts,
+PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts, bool early,
                                const double* part_sum, Piece& to) {
   using S = RigidSums;
   const bool leader = threadIdx.x % warp_size == 0;
@@ -223,7 +223,7 @@ PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_co
       for (int n = S::pins; n < S::count && plan.pins == 0; ++n) to.sum[n] = 0;
       to.reached = to.body.reached();
       to.motion_before = to.body.motion();
-      to.body = CoarseBody(RigidBody(to.sum));
+      to.body = CoarseBody(RigidBody(to.sum), early);
     }
     __syncwarp();
     if (!has_contacts) of_the_warp(to.body, [](CoarseBody& body) { body.move_free<WarpTerms>(); });

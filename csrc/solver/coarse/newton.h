@@ -22,6 +22,8 @@ struct RigidMotion {
 constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 30;
 // Of the size of a body: a motion that ends the passes. Of the radii: how far behind friction l they may be left.
 constexpr double still_share = 1e-7, lag_share = 1e-6;
+// The same of both, before the iterations.
+constexpr double early_share = 1e-3;
 // Of a motion: a step after which radii are renewed. Of these: a lag that ends the steps.
 constexpr double settled_share = 0.1;
 // Of the energy that moves a body by its size: a rise that is rounding.
@@ -97,7 +99,11 @@ class CoarseBody {
  public:
   CoarseBody() = default;
 
-  PD_HD explicit CoarseBody(const RigidBody& body) : body_(body) {
+  // `early`: before the iterations, which go on from it.
+  PD_HD CoarseBody(const RigidBody& body, bool early)
+      : body_(body),
+        still_(early ? early_share : still_share),
+        lag_(early ? early_share : lag_share) {
     size_ = square_root(body.square);
     length_ = size_ > 0 ? 1.0 / size_ : 1.0;
     accepted_ = trial_ = {{}, body.center, {0, 0, 0}};
@@ -160,8 +166,8 @@ class CoarseBody {
     accepted_ = trial_;
     contact_energy_ = sum[S::after];
     cuts_ = 0;
-    const bool still = length_of(twist_) <= still_share * size_ &&
-                       sum[S::lag] <= lag_share * lag_share * sum[S::radius];
+    const bool still =
+        length_of(twist_) <= still_ * size_ && sum[S::lag] <= lag_ * lag_ * sum[S::radius];
     done_ = (motions_ > 0 && still) || ++motions_ > most_motions;
     if (done_) return Next::none;
     find_quadratics();
@@ -195,11 +201,11 @@ class CoarseBody {
     for (int i = 0; i < 6; ++i) twist_[i] = at[i];
     ++steps_;
     const double lag = sum[S::lag], radius = sum[S::radius];
-    const double least = still_share * size_, share = settled_share * length_of(twist_);
+    const double least = still_ * size_, share = settled_share * length_of(twist_);
     const double small = least > share ? least : share;
     const bool near = way_ <= small;
     ends_ = (near && lag <= settled_share * settled_share * radius) || steps_ >= most_steps;
-    renews_ = near && lag > lag_share * lag_share * radius;
+    renews_ = near && lag > lag_ * lag_ * radius;
     return renews_ ? Next::none : ends_ ? Next::motion : Next::step;
   }
 
@@ -318,6 +324,7 @@ class CoarseBody {
   RigidMotion<double> accepted_, trial_;
   Mat3<double> second_;
   Vec3<double> force_, moment_;
+  double still_, lag_;    // of the size, and of the radii: that end the passes
   double size_, length_;  // length_: 1 / size_
   double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
   double way_ = 0, contact_energy_ = 0;
