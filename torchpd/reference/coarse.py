@@ -35,7 +35,7 @@ __all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "isl
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-OUTER = 6  # finite motions
+OUTER = 10  # finite motions
 PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free

@@ -19,7 +19,7 @@ struct RigidMotion {
   PD_HD Vec3<T> of(const Vec3<T>& y) const { return turn * (y - center) + shift; }
 };
 
-constexpr int most_motions = 6, most_steps = 12, most_cuts = 8, most_searches = 30;
+constexpr int most_motions = 10, most_steps = 12, most_cuts = 8, most_searches = 30;
 // Of the size of a body: a motion that ends the passes. Of the radii: how far behind friction l they may be left.
 constexpr double still_share = 1e-7, lag_share = 1e-6;
 // The same of both, before the iterations.
