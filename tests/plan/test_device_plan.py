@@ -276,6 +276,7 @@ def test_sizes_count_the_arrays(kernel: int, case: tuple[str, int], values: Scen
         "most_interior": np.diff(plan.patch_vertex).max(),
         "members": 0,
         "environments": 0,
+        "solid_pieces": len(free),
     }
     assert dict(zip(SIZES, plan.sizes.tolist(), strict=True)) == expected
 

@@ -165,7 +165,7 @@ def test_loose_pieces_are_numbered(plan: Plan, values: SceneValues) -> None:
     np.testing.assert_array_equal(group < 0, held)
     numbers = np.unique(group[group >= 0])
     np.testing.assert_array_equal(numbers, np.arange(int(plan.sizes[3])))
-    assert int(plan.sizes[4]) == len(numbers)  # of tetrahedra alone
+    assert int(plan.sizes[-1]) == len(numbers)  # of tetrahedra alone
     for number in numbers:
         assert len(np.unique(values.component[group == number])) == 1
 
@@ -229,11 +229,11 @@ def test_plan_to_keeps_integers(plan: Plan) -> None:
 
 
 def test_sizes_count_what_the_arrays_hold(plan: Plan, values: SceneValues) -> None:
-    slots = plan.patch_slot.diff()
+    slots, components = plan.patch_slot.diff(), int(plan.vertex_component.max()) + 1
     assert plan.sizes.tolist() == [
         len(values.rest_positions), len(values.tets), len(values.pin_vertices),
-        *(2 * [int(plan.vertex_component.max()) + 1]), len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
-        plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()), 1,
+        components, len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
+        plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()), 1, components,
     ]  # fmt: skip
 
 

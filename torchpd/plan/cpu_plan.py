@@ -195,13 +195,12 @@ def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
     return replace(plan, arrays=arrays, loose=values.loose)
 
 
-def _sizes(arrays: dict[str, NDArray[Any]], tets: int, components: Sequence[int], members: Any) -> NDArray[np.int32]:
+def _sizes(arrays: dict[str, NDArray[Any]], tets: int, components: int, solid: int, members: Any) -> NDArray[np.int32]:
     """Counts of a CPU plan, in the order of PlanSize in csrc/views/views.h."""
     slots = np.diff(arrays["patch_slot"])
     counts = (
-        len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), *components, len(arrays["tet_order"]),
-        len(slots), len(arrays["slot_vertex"]), len(arrays["shared_start"]) - 1, slots.max(),
-        members,
+        len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), components, len(arrays["tet_order"]),
+        len(slots), len(arrays["slot_vertex"]), len(arrays["shared_start"]) - 1, slots.max(), members, solid,
     )  # fmt: skip
     return np.array(counts, dtype=np.int32)
 
@@ -249,10 +248,10 @@ def compile_plan(
         )
     members = arrays.pop("members")
     internal = internal_numbers(arrays["vertex_order"])
-    group, *components = loose_pieces(values)
+    group, components, solid = loose_pieces(values)
     arrays["vertex_component"] = group[arrays["vertex_order"]]
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
-    arrays["sizes"] = _sizes(arrays, tets, components, members)
+    arrays["sizes"] = _sizes(arrays, tets, components, solid, members)
     table = PLAN_TABLE + STENCIL_TABLE if stencils else PLAN_TABLE
     tensors = (tensor_of(arrays[row.name]) for row in table)
     reals = tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors)

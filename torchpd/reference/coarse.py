@@ -42,7 +42,7 @@ HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of t
 STILL = 1e-7  # of the size of a body: a motion that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
 EARLY = 1e-3  # both, before the iterations
-SETTLED = 0.1  # of a motion: a step after which friction radii follow; of these: a lag that ends the steps
+SETTLED = 0.1  # of a motion: a next step with which friction radii follow; of these: a lag that ends the steps
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
@@ -292,8 +292,8 @@ def _model_minimum(
 ) -> tuple[Array, Array]:
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
-    Newton's steps, each ended where the model is least along it. Radii go half way to friction l after one that is
-    small beside the motion: all the way, what friction does to normal forces may drive them up and down.
+    Newton's steps, each ended where the model is least along it. Where the next one is small beside the motion, radii
+    go half way to friction l: all the way, what friction does to normal forces may drive them up and down.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -306,6 +306,14 @@ def _model_minimum(
         force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion
         # a line has no inertia about itself
         step = np.linalg.lstsq(matrix, force, rcond=1e-12)[0]
+        if motions.share(step) <= max(still, SETTLED * motions.share(motion)):
+            lag = contacts.friction * trial.normal_forces() - radius
+            left, size = np.linalg.norm(lag), np.linalg.norm(radius)
+            if left > behind * size:
+                radius = radius + 0.5 * lag
+            if left <= SETTLED * size:
+                break
+            continue
         way, linear, quadratic = jacobian @ step, float(force @ step), float(step @ hessian @ step)
         linear -= float((way * trial.forces(radius)).sum())
 
@@ -324,15 +332,7 @@ def _model_minimum(
             for _ in range(30):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
-        motion, share = motion + high * step, motions.share(high * step)
-        lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
-        if share > max(still, SETTLED * motions.share(motion)):
-            continue
-        left, size = np.linalg.norm(lag), np.linalg.norm(radius)
-        if left > behind * size:
-            radius = radius + 0.5 * lag
-        if left <= SETTLED * size:
-            break
+        motion = motion + high * step
     return motion, radius
 
 

@@ -2,7 +2,7 @@
 // (solver/coarse/envelope.h).
 //
 // Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each
-// ended where Phi is least along it. After one that is small beside the motion, radii of friction go half way to friction times l. The
+// ended where Phi is least along it. Where the next one is small beside the motion, radii of friction go half way to friction times l. The
 // motion is halved until Phi itself has not risen. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
@@ -24,7 +24,7 @@ constexpr int most_motions = 10, most_steps = 12, most_cuts = 8, most_searches =
 constexpr double still_share = 1e-7, lag_share = 1e-6;
 // The same of both, before the iterations.
 constexpr double early_share = 1e-3;
-// Of a motion: a step after which radii are renewed. Of these: a lag that ends the steps.
+// Of a motion: a next step with which it ends, once radii are renewed. Of these: a lag that lets it end.
 constexpr double settled_share = 0.1;
 // Of the energy that moves a body by its size: a rise that is rounding.
 constexpr double energy_rounding = 1e-14;
@@ -127,8 +127,7 @@ class CoarseBody {
   PD_HD void move_free() {
     const double none[ContactSums::count] = {};
     while (!done_) {
-      if (end_motion(none) == Next::step) {
-        begin_step<Terms>(none);
+      if (end_motion<Terms>(none) == Next::step) {
         for (int i = 0; i < 6; ++i) twist_[i] = step_[i];
       }
       try_motion();
@@ -137,15 +136,16 @@ class CoarseBody {
 
   template <class Terms = CoarseTerms>
   PD_HD void pass(const double (&sum)[ContactSums::count]) {
-    const Next next = finite_ ? end_motion(sum) : renews_ ? renewed() : go_on<Terms>(sum);
-    if (next == Next::step) begin_step<Terms>(sum);
-    if (next == Next::step || next == Next::search) try_step();
+    const Next next = finite_   ? end_motion<Terms>(sum)
+                      : renews_ ? renewed<Terms>(sum)
+                                : go_on<Terms>(sum);
+    if (next == Next::step) try_step();
     if (next == Next::motion) try_motion();
   }
 
  private:
-  // What follows a pass: nothing, or a new step, one that is shortened, or a finite motion.
-  enum class Next { none, step, search, motion };
+  // What follows a pass: nothing, a trial of a step, or a finite motion.
+  enum class Next { none, step, motion };
 
   // Of the quadratics, relative to no motion.
   PD_HD double energy(const RigidMotion<double>& motion) const {
@@ -154,6 +154,7 @@ class CoarseBody {
   }
 
   // After the pass of a finite motion: accepts it, or halves its twist.
+  template <class Terms>
   PD_HD Next end_motion(const double (&sum)[ContactSums::count]) {
     using S = ContactSums;
     const double before = energy(accepted_) + sum[S::before],
@@ -173,13 +174,12 @@ class CoarseBody {
     find_quadratics();
     for (double& number : twist_) number = 0;
     steps_ = 0;
-    return Next::step;
+    return decide<Terms>(sum);
   }
 
   // After a pass to first order: ends the step, or goes on to where Phi is least along it.
   template <class Terms>
   PD_HD Next go_on(const double (&sum)[ContactSums::count]) {
-    using S = ContactSums;
     double at[6];
     for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
     const Terms terms = terms_at<Terms>(at, sum);
@@ -196,38 +196,45 @@ class CoarseBody {
                       absolute(next - share_) * length_of(step_) <= exact_share * size_;
     if (!ends && ++searches_ <= most_searches) {
       share_ = next;
-      return Next::search;
+      return Next::step;
     }
     for (int i = 0; i < 6; ++i) twist_[i] = at[i];
-    ++steps_;
-    const double lag = sum[S::lag], radius = sum[S::radius];
-    const double least = still_ * size_, share = settled_share * length_of(twist_);
-    const double small = least > share ? least : share;
-    const bool near = way_ <= small;
-    ends_ = (near && lag <= settled_share * settled_share * radius) || steps_ >= most_steps;
-    renews_ = near && lag > lag_ * lag_ * radius;
-    return renews_ ? Next::none : ends_ ? Next::motion : Next::step;
+    return decide<Terms>(sum);
   }
 
   // After a pass that has renewed radii.
-  PD_HD Next renewed() {
+  template <class Terms>
+  PD_HD Next renewed(const double (&sum)[ContactSums::count]) {
     renews_ = false;
-    return ends_ ? Next::motion : Next::step;
+    return ends_ ? Next::motion : decide<Terms>(sum);
   }
 
+  // From the sums at the twist: Newton's next step; where that is small, radii are renewed, and the motion ends.
   template <class Terms>
-  PD_HD void begin_step(const double (&sum)[ContactSums::count]) {
+  PD_HD Next decide(const double (&sum)[ContactSums::count]) {
+    if (++steps_ > most_steps) return Next::motion;
     Terms terms = terms_at<Terms>(twist_, sum);
     terms.solve(step_);
     searches_ = 0;
     low_ = 0, high_ = share_ = 1;
+    const double least = still_ * size_, part = settled_share * length_of(twist_);
+    if (length_of(step_) > (least > part ? least : part)) return Next::step;
+    const double lag = sum[ContactSums::lag], radius = sum[ContactSums::radius];
+    ends_ = lag <= settled_share * settled_share * radius;
+    renews_ = lag > lag_ * lag_ * radius;
+    share_ = 0;  // a pass at the twist
+    return renews_ ? Next::step : Next::motion;
   }
 
   // entry n of a vector; a group of threads has different n, and keeps the vector in registers
   PD_HD static double pick(const double (&from)[6], int n) {
+#if defined(__CUDA_ARCH__)
     double entry = from[0];
     for (int i = 1; i < 6; ++i) entry = n == i ? from[i] : entry;
     return entry;
+#else
+    return from[n];
+#endif
   }
 
   PD_HD static double length_of(const double (&twist)[6]) {
@@ -238,7 +245,6 @@ class CoarseBody {
   // The trial to first order: the twist and the step.
   PD_HD void try_step() {
     finite_ = false;
-    way_ = share_ * length_of(step_);
     double at[6];
     for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
     set_trial(at, cross_matrix(turn_of(at)));
@@ -327,7 +333,7 @@ class CoarseBody {
   double still_, lag_;    // of the size, and of the radii: that end the passes
   double size_, length_;  // length_: 1 / size_
   double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
-  double way_ = 0, contact_energy_ = 0;
+  double contact_energy_ = 0;
   int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
   bool finite_ = true, ends_ = false, renews_ = false, done_ = true;
 };
