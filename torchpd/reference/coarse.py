@@ -293,7 +293,7 @@ def _model_minimum(
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
     Newton's steps, each ended where the model is least along it. Where the next one is small beside the motion, radii
-    go half way to friction l: all the way, what friction does to normal forces may drive them up and down.
+    go half way to friction l, unless they are near: what friction does to normal forces may drive them up and down.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -309,9 +309,10 @@ def _model_minimum(
         if motions.share(step) <= max(still, SETTLED * motions.share(motion)):
             lag = contacts.friction * trial.normal_forces() - radius
             left, size = np.linalg.norm(lag), np.linalg.norm(radius)
+            settled = left <= SETTLED * size
             if left > behind * size:
-                radius = radius + 0.5 * lag
-            if left <= SETTLED * size:
+                radius = radius + (1.0 if settled else 0.5) * lag
+            if settled:
                 break
             continue
         way, linear, quadratic = jacobian @ step, float(force @ step), float(step @ hessian @ step)

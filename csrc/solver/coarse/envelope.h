@@ -215,7 +215,7 @@ template <class W>
 struct CoarseTrial {
   Mat3<W> turn_before, turn_after;  // R - I; to first order [w]x R
   Vec3<W> center, shift_before, shift_after;
-  W finite, renews;  // 1 or 0; 0.5 or 0
+  W finite, renews;  // 1 or 0; 1, 0.5 or 0
 };
 
 // Adds the contacts of a vertex. `forces[n stride]`: ContactForce of contact n.

@@ -2,8 +2,9 @@
 // (solver/coarse/envelope.h).
 //
 // Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each
-// ended where Phi is least along it. Where the next one is small beside the motion, radii of friction go half way to friction times l. The
-// motion is halved until Phi itself has not risen. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
+// ended where Phi is least along it. Where the next one is small beside the motion, radii of friction go half way to friction
+// times l, or all the way if they are near. The motion is halved until Phi itself has not risen. A pass takes the contact sums
+// of one trial. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
 #include "solver/coarse/sums.h"
@@ -118,8 +119,13 @@ class CoarseBody {
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
-    return {accepted_.turn, trial_.turn,         body_.center,       accepted_.shift,
-            trial_.shift,   finite_ ? 1.0 : 0.0, renews_ ? 0.5 : 0.0};
+    return {accepted_.turn,
+            trial_.turn,
+            body_.center,
+            accepted_.shift,
+            trial_.shift,
+            finite_ ? 1.0 : 0.0,
+            renews_ ? (ends_ ? 1.0 : 0.5) : 0.0};
   }
 
   // All passes of a body without contacts: there the first order is exact.
