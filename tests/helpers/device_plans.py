@@ -25,7 +25,7 @@ KERNELS = BLOCK, CLUSTER, GRID, STREAM = range(4)
 MOST_CLUSTER = 16  # patches
 BOTH = [[0, 1, 2, 3], [0, 1, 2, 4]]  # the corners of both tetrahedra of a pair
 SIZES = ["kernel", "vertices", "tets", "pins", "pieces", "blocks", "patches", "slots", "shared", "parts", "senders"]
-SIZES += ["most_slots", "most_pairs", "most_entries", "most_interior", "members", "environments"]
+SIZES += ["most_slots", "most_pairs", "most_entries", "most_interior", "members", "environments", "solid_pieces"]
 
 
 def delaunay_mesh() -> pd.TetMesh:
