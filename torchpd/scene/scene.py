@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -214,9 +215,8 @@ class Scene:
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
         stencils = merge_groups(self._stencils(starts))
-        masses = np.concatenate([body.masses() for body in self.bodies])
-        component = _joined(self._components(), stencils)
-        pinned = PinnedComponents.of(positions, masses, component, pin_vertices)
+        component = _joined(self._components, stencils)
+        pinned = PinnedComponents.of(positions, self._masses, component, pin_vertices)
         gravity, damping = self._all(Gravity), self._all(Damping)
         none = np.zeros(0)
         poisson, tet_group = self._poisson()
@@ -225,7 +225,7 @@ class Scene:
             tets=self._tets_of(self.elastic_solids),
             stiffness=np.concatenate([none, *(solid.stiffness for solid in self.elastic_solids)]),
             density=np.concatenate([none, *(solid.filled_density for solid in self.elastic_solids)]),
-            masses=masses,
+            masses=self._masses,
             pin_vertices=pin_vertices,
             pin_stiffness=stiffness,
             pin_targets=positions[pin_vertices],
@@ -252,13 +252,23 @@ class Scene:
                 yield group if group.tets is None else replace(group, tets=group.tets + tets)
             tets += len(part.mesh.tets) if isinstance(part, Solid) and part.plastic is None else 0
 
+    @cached_property
+    def _masses(self) -> Array:
+        """Lumped masses of the vertices of all bodies [V] kg."""
+        masses = np.concatenate([body.masses() for body in self.bodies])
+        masses.setflags(write=False)
+        return masses
+
+    @cached_property
     def _components(self) -> Index:
         """Number of the connected component of each vertex within its body [V]."""
         parts, count = [], 0
         for body in self.bodies:
             parts.append(mesh_components(body.elements) + count)
             count = int(parts[-1].max()) + 1
-        return np.concatenate(parts)
+        components = np.concatenate(parts)
+        components.setflags(write=False)
+        return components
 
     def _poisson(self) -> tuple[Array | None, Index | None]:
         """Poisson's ratios of all tetrahedra and their groups, or None if every solid has the scalar 0."""

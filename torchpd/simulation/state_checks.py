@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.checks import check_like, check_whole, expand_shared, to_full_precision
+from ..common.memory import chunks
 from ..common.warn import warn_user
 from ..scene.scene import Scene
 from .state import History, HistoryState, State
@@ -75,10 +76,14 @@ def report_resolution(scene: Scene, dtype: torch.dtype) -> None:
 
 def _shortest_and_farthest(points: Array, elements: Index) -> tuple[Array, Array]:
     """Shortest edge of each element [E] m, and its largest coordinate [E] m."""
-    corners = [points[column] for column in elements.T]
-    edges = (one - other for one, other in combinations(corners, 2))
-    shortest = np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges)))
-    return shortest, np.abs(points).max(axis=1)[elements].max(axis=1)
+    reach = np.abs(points).max(axis=1)
+    shortest, farthest = np.empty(len(elements)), np.empty(len(elements))
+    for some in chunks(len(elements)):
+        corners = [points[column] for column in elements[some].T]
+        edges = (one - other for one, other in combinations(corners, 2))
+        shortest[some] = np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges)))
+        farthest[some] = reach[elements[some]].max(axis=1)
+    return shortest, farthest
 
 
 def check_positive_number(name: str, value: float, unit: str) -> float:

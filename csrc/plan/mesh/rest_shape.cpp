@@ -36,20 +36,27 @@ double largest_eigenvalue(const Mat3<double>& a) {
 
 }  // namespace
 
-Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
+RestShape rest_shape(const double* positions, const std::array<std::int64_t, 4>& tet) {
   const auto at = [&](int k) { return row_of(positions, tet[k]); };
   const Mat3<double> dm = from_columns(at(1) - at(0), at(2) - at(0), at(3) - at(0));
   const Mat3<double> adjoint = transpose(cofactor(dm));
   const double det = dot(dm.row[0], cofactor(dm).row[0]);
   const Mat3<double> inverse = (1 / det) * adjoint;
   const Vec3<double>(&n)[3] = inverse.row;
-  const Vec3<double> n0 = -((n[0] + n[1]) + n[2]);
-  return {{n[0].x, n[0].y, n[0].z, n[1].x, n[1].y, n[1].z, n[2].x, n[2].y, n[2].z},
-          det / 6,
-          element_bound(std::array<std::array<double, 3>, 4>{{{n0.x, n0.y, n0.z},
-                                                              {n[0].x, n[0].y, n[0].z},
-                                                              {n[1].x, n[1].y, n[1].z},
-                                                              {n[2].x, n[2].y, n[2].z}}})};
+  return {{n[0].x, n[0].y, n[0].z, n[1].x, n[1].y, n[1].z, n[2].x, n[2].y, n[2].z}, det / 6};
+}
+
+std::array<std::array<double, 3>, 4> RestShape::gradients() const {
+  const auto& n = inverse;
+  return {{{-((n[0] + n[3]) + n[6]), -((n[1] + n[4]) + n[7]), -((n[2] + n[5]) + n[8])},
+           {n[0], n[1], n[2]},
+           {n[3], n[4], n[5]},
+           {n[6], n[7], n[8]}}};
+}
+
+Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
+  const RestShape shape = rest_shape(positions, tet);
+  return {shape, element_bound(shape.gradients())};
 }
 
 template <std::size_t Corners>

@@ -7,13 +7,21 @@
 
 namespace pd {
 
-struct Rest {
+struct RestShape {
   std::array<double, 9> inverse;  // Dm^-1, row by row: the shape gradients of corners 1 to 3
   double volume;                  // negative for inverted winding of the corners
-  double bound;                   // l_e
+
+  // of all four corners
+  std::array<std::array<double, 3>, 4> gradients() const;
 };
 
 // Rest shape of the four rows `tet` of `positions` [vertices, 3].
+RestShape rest_shape(const double* positions, const std::array<std::int64_t, 4>& tet);
+
+struct Rest : RestShape {
+  double bound;  // l_e
+};
+
 Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet);
 
 // Inverse rest matrices of one or two tetrahedra on the face of corners 0, 1 and 2, in the frame of
