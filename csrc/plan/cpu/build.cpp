@@ -5,6 +5,7 @@
 #include "plan/mesh/stencils.h"
 
 #include <algorithm>
+#include <array>
 #include <limits>
 #include <stdexcept>
 
@@ -36,19 +37,30 @@ void add_slots(MeshPlan& plan, const Numbering& n, const MeshElements& elements,
         "a patch has more vertices than 16 bits count: give a smaller patch_size");
 }
 
-// One lane of a block of tetrahedra.
-void set_lane(MeshPlan& plan, std::size_t block, int lane, const MeshElements& elements,
-              std::int32_t t, bool padding, const std::vector<std::int32_t>& slot_of) {
+// One block of tetrahedra; `padding`: lanes that repeat another and count nothing.
+void set_block(MeshPlan& plan, std::size_t block, const MeshElements& elements,
+               const std::array<std::int32_t, lanes>& tets, const std::array<bool, lanes>& padding,
+               const std::vector<std::int32_t>& slot_of) {
   const double* x = elements.positions;
-  const std::int64_t* corner = elements.tets + 4 * std::int64_t(t);
-  const Rest rest = rest_of(x, {corner[0], corner[1], corner[2], corner[3]});
-  const auto face = face_rest<4>(x, {corner[0], corner[1], corner[2], corner[3]});
-  plan.tet_order[block * lanes + lane] = t;
-  plan.tet_volume[block * lanes + lane] = padding ? 0 : rest.volume;
-  plan.tet_bound[block * lanes + lane] = elements.averaged.has_trace(t) ? rest.bound : -rest.bound;
-  for (int n = 0; n < 6; ++n) plan.tet_rest[(block * 6 + n) * lanes + lane] = face[n];
-  for (int k = 0; k < 4; ++k)
-    plan.tet_corner[(block * 4 + k) * lanes + lane] = std::int16_t(slot_of[corner[k]]);
+  for (int first = 0; first < lanes; first += int(bound_lanes)) {
+    std::array<RestShape, bound_lanes> shapes;
+    for (int i = 0; i < int(bound_lanes); ++i)
+      shapes[i] = rest_shape(x, elements.tet(tets[first + i]));
+    const std::array<double, bound_lanes> bounds = tet_bounds(shapes);
+    for (int i = 0; i < int(bound_lanes); ++i) {
+      const int lane = first + i;
+      const std::int32_t t = tets[lane];
+      const std::array<std::int64_t, 4> corner = elements.tet(t);
+      const auto face = face_rest<4>(x, corner);
+      plan.tet_order[block * lanes + lane] = t;
+      plan.tet_volume[block * lanes + lane] = padding[lane] ? 0 : shapes[i].volume;
+      plan.tet_bound[block * lanes + lane] =
+          elements.averaged.has_trace(t) ? bounds[i] : -bounds[i];
+      for (int n = 0; n < 6; ++n) plan.tet_rest[(block * 6 + n) * lanes + lane] = face[n];
+      for (int k = 0; k < 4; ++k)
+        plan.tet_corner[(block * 4 + k) * lanes + lane] = std::int16_t(slot_of[corner[k]]);
+    }
+  }
 }
 
 // Blocks of tetrahedra of one patch: the members of a group have one lane of as many blocks. Neighbours go to different
@@ -64,13 +76,16 @@ void add_blocks(MeshPlan& plan, const MeshElements& elements, std::span<const st
       plan.tet_bound.resize((block + 1) * lanes);
       plan.tet_rest.resize((block + 1) * 6 * lanes);
       plan.tet_corner.resize((block + 1) * 4 * lanes);
+      std::array<std::int32_t, lanes> tets;
+      std::array<bool, lanes> padding;
       for (int lane = 0; lane < lanes; ++lane) {
         const std::int64_t i = lane * blocks + b;
         const std::int32_t e = patch[std::min(i, count - 1)];
         const int last = elements.members(e) - 1;
-        set_lane(plan, block, lane, elements, elements.member(e, std::min(member, last)),
-                 i >= count || member > last, slot_of);
+        tets[lane] = elements.member(e, std::min(member, last));
+        padding[lane] = i >= count || member > last;
       }
+      set_block(plan, block, elements, tets, padding, slot_of);
     }
   }
   plan.patch_block.push_back(std::int32_t(plan.tet_order.size() / lanes));

@@ -14,24 +14,52 @@ Vec3<double> row_of(const double* positions, std::int64_t vertex) {
   return {x[0], x[1], x[2]};
 }
 
-// Largest eigenvalue of a symmetric positive semidefinite 3x3 matrix, by Newton's method on its characteristic
-// polynomial, starting above at its trace. Near a multiple root that loses up to two thirds of the digits; there the
-// singular values replace it.
-double largest_eigenvalue(const Mat3<double>& a) {
-  const Mat3<double> c = cofactor(a);
-  const double trace = a.row[0].x + a.row[1].y + a.row[2].z;
-  const double minors = c.row[0].x + c.row[1].y + c.row[2].z;
-  const double det = dot(a.row[0], c.row[0]);
-  double l = trace;
-  for (int step = 0; step < 100; ++step) {
-    const double p = ((l - trace) * l + minors) * l - det;
-    const double slope = (3 * l - 2 * trace) * l + minors;
-    const double change = slope > 0 ? p / slope : 0;
-    l -= change;
-    if (!(change > 1e-15 * trace)) break;
+// S^T S of the normalised gradients S, whose nonzero eigenvalues are those of S S^T.
+Mat3<double> normal_matrix(std::span<const std::array<double, 3>> gradients) {
+  Mat3<double> sum = {};
+  for (const auto& g : gradients) {
+    const Vec3<double> n = {g[0], g[1], g[2]};
+    if (dot(n, n) == 0) continue;
+    const Vec3<double> unit = (1 / std::sqrt(dot(n, n))) * n;
+    sum = {{sum.row[0] + unit.x * unit, sum.row[1] + unit.y * unit, sum.row[2] + unit.z * unit}};
   }
-  const bool simple = (3 * l - 2 * trace) * l + minors > 0.01 * trace * trace;
-  return simple ? l : signed_svd(a).s[0];
+  return sum;
+}
+
+// Largest eigenvalues of symmetric positive semidefinite 3x3 matrices, by Newton's method on the characteristic
+// polynomial, starting above at its trace. Near a multiple root that loses up to two thirds of the digits; there the
+// singular values replace it. Several matrices at once, since each step waits for a division.
+template <std::size_t Lanes>
+std::array<double, Lanes> largest_eigenvalues(const std::array<Mat3<double>, Lanes>& a) {
+  std::array<double, Lanes> trace, minors, det, largest;
+  std::array<bool, Lanes> goes_on;
+  for (std::size_t i = 0; i < Lanes; ++i) {
+    const Mat3<double> c = cofactor(a[i]);
+    trace[i] = a[i].row[0].x + a[i].row[1].y + a[i].row[2].z;
+    minors[i] = c.row[0].x + c.row[1].y + c.row[2].z;
+    det[i] = dot(a[i].row[0], c.row[0]);
+    largest[i] = trace[i];
+    goes_on[i] = true;
+  }
+  bool any = true;
+  for (int step = 0; step < 100 && any; ++step) {
+    any = false;
+    for (std::size_t i = 0; i < Lanes; ++i) {
+      const double l = largest[i];
+      const double p = ((l - trace[i]) * l + minors[i]) * l - det[i];
+      const double slope = (3 * l - 2 * trace[i]) * l + minors[i];
+      const double change = slope > 0 ? p / slope : 0;
+      largest[i] = goes_on[i] ? l - change : l;
+      goes_on[i] = goes_on[i] & (change > 1e-15 * trace[i]);
+      any = any | goes_on[i];
+    }
+  }
+  for (std::size_t i = 0; i < Lanes; ++i) {
+    const double l = largest[i];
+    const bool simple = (3 * l - 2 * trace[i]) * l + minors[i] > 0.01 * trace[i] * trace[i];
+    if (!simple) largest[i] = signed_svd(a[i]).s[0];
+  }
+  return largest;
 }
 
 }  // namespace
@@ -54,9 +82,10 @@ std::array<std::array<double, 3>, 4> RestShape::gradients() const {
            {n[6], n[7], n[8]}}};
 }
 
-Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet) {
-  const RestShape shape = rest_shape(positions, tet);
-  return {shape, element_bound(shape.gradients())};
+std::array<double, bound_lanes> tet_bounds(const std::array<RestShape, bound_lanes>& shapes) {
+  std::array<Mat3<double>, bound_lanes> matrices;
+  for (std::size_t i = 0; i < bound_lanes; ++i) matrices[i] = normal_matrix(shapes[i].gradients());
+  return largest_eigenvalues(matrices);
 }
 
 template <std::size_t Corners>
@@ -87,15 +116,7 @@ template std::array<double, 6> face_rest(const double*, const std::array<std::in
 template std::array<double, 9> face_rest(const double*, const std::array<std::int64_t, 5>&);
 
 double element_bound(std::span<const std::array<double, 3>> gradients) {
-  // the nonzero eigenvalues of S S^T, S the normalised gradients, are those of the 3x3 matrix S^T S
-  Mat3<double> sum = {};
-  for (const auto& g : gradients) {
-    const Vec3<double> n = {g[0], g[1], g[2]};
-    if (dot(n, n) == 0) continue;
-    const Vec3<double> unit = (1 / std::sqrt(dot(n, n))) * n;
-    sum = {{sum.row[0] + unit.x * unit, sum.row[1] + unit.y * unit, sum.row[2] + unit.z * unit}};
-  }
-  return largest_eigenvalue(sum);
+  return largest_eigenvalues<1>({normal_matrix(gradients)})[0];
 }
 
 }  // namespace pd

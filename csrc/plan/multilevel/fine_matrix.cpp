@@ -45,12 +45,8 @@ struct Element {
   double measure;
 };
 
-std::array<std::int64_t, 4> four(std::span<const std::int64_t> corner) {
-  return {corner[0], corner[1], corner[2], corner[3]};
-}
-
 Element tetrahedron(const MeshElements& elements, std::int64_t tet) {
-  const RestShape rest = rest_shape(elements.positions, four(elements.corners(tet)));
+  const RestShape rest = rest_shape(elements.positions, elements.tet(tet));
   Element made{{}, rest.volume};
   std::ranges::copy(rest.gradients(), made.gradient.begin());
   return made;
@@ -78,14 +74,20 @@ Element stencil(const MeshElements& elements, std::int64_t element) {
 // l_e of every element.
 std::vector<double> bounds(const MeshElements& elements, int threads) {
   std::vector<double> bound(elements.count());
-  for_rows(elements.count(), threads, [&](std::int64_t e) {
-    if (e < elements.tet_count) {
-      bound[e] = rest_of(elements.positions, four(elements.corners(e))).bound;
-    } else {
-      const auto [group, s] = stencil_at(elements, e);
-      bound[e] = stencil_bound(*group, s);
-    }
+  constexpr std::int64_t several = bound_lanes;
+  for_rows((elements.tet_count + several - 1) / several, threads, [&](std::int64_t number) {
+    const std::int64_t first = several * number, last = elements.tet_count - 1;
+    std::array<RestShape, bound_lanes> shapes;
+    for (std::int64_t i = 0; i < several; ++i)
+      shapes[i] = rest_shape(elements.positions, elements.tet(std::min(first + i, last)));
+    const std::array<double, bound_lanes> found = tet_bounds(shapes);
+    std::copy_n(found.begin(), std::min(several, elements.tet_count - first),
+                bound.begin() + first);
   });
+  for (std::int64_t e = elements.tet_count; e < elements.count(); ++e) {
+    const auto [group, s] = stencil_at(elements, e);
+    bound[e] = stencil_bound(*group, s);
+  }
   return bound;
 }
 
