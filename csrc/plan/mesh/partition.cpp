@@ -103,27 +103,66 @@ class Bisection {
   Partition mesh_;
 };
 
+// A vertex of a patch.
+struct Visit {
+  std::int32_t vertex, patch;
+};
+
+// The vertices of every patch as they appear in it, patch by patch.
+std::vector<std::vector<Visit>> visits_of(const Partition& mesh, const MeshElements& elements) {
+  std::vector<std::vector<Visit>> parts(most_threads());
+  run_team(most_threads(), [&](const Team& team) {
+    std::vector<std::int32_t> last(elements.vertices, -1);
+    std::vector<Visit>& visits = parts[team.rank];
+    visits.reserve(2 * elements.vertices / team.size);
+    for (std::int64_t p = team.begin(mesh.patches()); p < team.end(mesh.patches()); ++p) {
+      for (const std::int32_t e : mesh.patch(int(p))) {
+        for (const std::int64_t v : elements.corners(e)) {
+          if (last[v] == p) continue;
+          last[v] = std::int32_t(p);
+          visits.push_back({std::int32_t(v), std::int32_t(p)});
+        }
+      }
+    }
+  });
+  return parts;
+}
+
+// Calls work(visit) for all of them in order.
+template <class Work>
+void for_visits(const std::vector<std::vector<Visit>>& parts, Work work) {
+  for (const std::vector<Visit>& part : parts) std::for_each(part.begin(), part.end(), work);
+}
+
 // Orders shared vertices so that those of the same patches are adjacent, and one patch reads another's in a run. The
 // sort key is the reversed list of patches: the last patch has all forces on them. `shared` keeps its order
 // otherwise.
-void gather_by_patches(const Partition& mesh, const MeshElements& elements,
-                       const std::vector<std::uint8_t>& is_shared,
-                       std::vector<std::int64_t>& shared) {
-  std::vector<std::int32_t> number(is_shared.size(), -1);
-  for (std::size_t i = 0; i < shared.size(); ++i) number[shared[i]] = std::int32_t(i);
-  std::vector<std::vector<std::int32_t>> patches(shared.size());
-  for (int p = 0; p < mesh.patches(); ++p) {
-    for (const std::int32_t e : mesh.patch(p)) {
-      for (const std::int64_t v : elements.corners(e)) {
-        const std::int32_t i = number[v];
-        if (i >= 0 && (patches[i].empty() || patches[i].back() != p)) patches[i].push_back(p);
-      }
-    }
+void gather_by_patches(const std::vector<std::vector<Visit>>& visits,
+                       const std::vector<std::int32_t>& patches_of,
+                       std::vector<std::int32_t>& shared) {
+  struct List {
+    std::int32_t vertex;
+    std::int64_t begin, end;
+  };
+  std::vector<List> lists;
+  lists.reserve(shared.size());
+  std::vector<std::int32_t> number(patches_of.size(), -1);
+  std::int64_t end = 0;
+  for (const std::int32_t v : shared) {
+    number[v] = std::int32_t(lists.size());
+    end += patches_of[v];
+    lists.push_back({v, end, end});
   }
-  std::stable_sort(shared.begin(), shared.end(), [&](std::int64_t a, std::int64_t b) {
-    const auto &one = patches[number[a]], &two = patches[number[b]];
-    return std::lexicographical_compare(one.rbegin(), one.rend(), two.rbegin(), two.rend());
+  std::vector<std::int32_t> patches(end);
+  for_visits(visits, [&](const Visit& visit) {
+    if (const std::int32_t i = number[visit.vertex]; i >= 0)
+      patches[--lists[i].begin] = visit.patch;
   });
+  std::stable_sort(lists.begin(), lists.end(), [&](const List& a, const List& b) {
+    return std::lexicographical_compare(patches.begin() + a.begin, patches.begin() + a.end,
+                                        patches.begin() + b.begin, patches.begin() + b.end);
+  });
+  std::ranges::transform(lists, shared.begin(), &List::vertex);
 }
 
 }  // namespace
@@ -133,42 +172,31 @@ Partition partition_mesh(const MeshElements& elements, std::int64_t patches, std
 }
 
 Numbering number_vertices(const Partition& mesh, const MeshElements& elements) {
-  const std::int64_t vertices = elements.vertices;
+  const std::vector<std::vector<Visit>> visits = visits_of(mesh, elements);
+  std::vector<std::int32_t> patches_of(elements.vertices, 0);
+  for_visits(visits, [&](const Visit& visit) { ++patches_of[visit.vertex]; });
   Numbering n;
-  n.is_shared.assign(vertices, 0);
-  n.internal.assign(vertices, -1);
-  std::vector<std::int32_t> owner(vertices, -1);  // first patch of each vertex
-  std::vector<std::int64_t> by_owner;             // in order of first appearance
-  by_owner.reserve(vertices);
-  for (int p = 0; p < mesh.patches(); ++p) {
-    for (const std::int32_t e : mesh.patch(p)) {
-      for (const std::int64_t v : elements.corners(e)) {
-        if (owner[v] < 0) {
-          owner[v] = p;
-          by_owner.push_back(v);
-        } else if (owner[v] != p) {
-          n.is_shared[v] = 1;
-        }
-      }
-    }
-  }
+  n.is_shared.assign(elements.vertices, 0);
+  n.internal.assign(elements.vertices, -1);
   n.patch_vertex.assign(mesh.patches() + 1, 0);
-  n.vertex_order.reserve(by_owner.size());
-  const auto append = [&](std::int64_t v) {
+  n.vertex_order.reserve(elements.vertices);
+  const auto append = [&](std::int32_t v) {
     n.internal[v] = std::int32_t(n.vertex_order.size());
-    n.vertex_order.push_back(std::int32_t(v));
+    n.vertex_order.push_back(v);
   };
-  std::vector<std::int64_t> shared;
-  for (const std::int64_t v : by_owner) {
-    if (n.is_shared[v]) {
-      shared.push_back(v);
-    } else {
+  std::vector<std::int32_t> shared;
+  for_visits(visits, [&](const Visit& visit) {
+    const auto [v, p] = visit;
+    if (patches_of[v] == 1) {
       append(v);
-      ++n.patch_vertex[owner[v] + 1];
+      ++n.patch_vertex[p + 1];
+    } else if (!n.is_shared[v]) {
+      n.is_shared[v] = 1;
+      shared.push_back(v);
     }
-  }
-  gather_by_patches(mesh, elements, n.is_shared, shared);
-  for (const std::int64_t v : shared) append(v);
+  });
+  gather_by_patches(visits, patches_of, shared);
+  for (const std::int32_t v : shared) append(v);
   std::partial_sum(n.patch_vertex.begin(), n.patch_vertex.end(), n.patch_vertex.begin());
   return n;
 }
