@@ -18,6 +18,7 @@ from ..common.checks import as_array, check_finite, check_scalar, check_shape, c
 from ..common.memory import chunks
 from ..common.synonyms import Renamed, check_arguments
 from ..common.warn import SceneWarning, warn_user
+from ..geometry.mesh_checks import determinants
 from ..geometry.mesh_quality import shape_gradients
 from ..geometry.tet_mesh import TetMesh
 from .averaging import average_over
@@ -199,9 +200,7 @@ class Solid(Body):
         masses, density = np.zeros(len(self.mesh.vertices)), self.filled_density
         for some in chunks(len(density)):
             tets = self.mesh.tets[some]
-            corners = self.mesh.vertices[tets]
-            edges = corners[:, 1:] - corners[:, :1]
-            np.add.at(masses, tets, (density[some] * np.linalg.det(edges) / 24.0)[:, None])
+            np.add.at(masses, tets, (density[some] * determinants(self.mesh.vertices, tets) / 24.0)[:, None])
         return masses
 
     @cached_property
