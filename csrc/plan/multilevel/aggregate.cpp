@@ -105,9 +105,8 @@ class Fronts {
     const auto is_valid = [&](const Item& item) { return item.first <= distance[item.second]; };
     for (Item item; queue_.pop(item, is_valid);) {
       const auto [d, v] = item;
-      for (std::int32_t e = graph_.start[v]; e < graph_.start[v + 1]; ++e) {
-        const std::int32_t u = graph_.neighbour[e];
-        const double there = d + graph_.length[e];
+      for (const auto& [length, u] : graph_.edges(v)) {
+        const double there = d + length;
         if (!(there < distance[u])) continue;
         distance[u] = there;
         label[u] = label[v];
@@ -146,9 +145,9 @@ std::int32_t deepest(const Graph& graph, const std::vector<std::int32_t>& label,
   const auto is_inside = [&](std::int32_t a, std::int32_t b) { return label[a] == label[b]; };
   std::priority_queue<Item, std::vector<Item>, std::greater<Item>> queue;
   for (const std::int32_t v : members) {
-    const auto first = graph.neighbour.begin() + graph.start[v],
-               end = graph.neighbour.begin() + graph.start[v + 1];
-    if (std::all_of(first, end, [&](std::int32_t u) { return is_inside(u, v); })) continue;
+    if (std::ranges::all_of(graph.edges(v),
+                            [&](const auto& e) { return is_inside(e.neighbour, v); }))
+      continue;
     distance[v] = 0;
     queue.emplace(0.0, v);
   }
@@ -156,9 +155,8 @@ std::int32_t deepest(const Graph& graph, const std::vector<std::int32_t>& label,
     const auto [d, v] = queue.top();
     queue.pop();
     if (d > distance[v]) continue;
-    for (std::int32_t e = graph.start[v]; e < graph.start[v + 1]; ++e) {
-      const std::int32_t u = graph.neighbour[e];
-      const double there = d + graph.length[e];
+    for (const auto& [length, u] : graph.edges(v)) {
+      const double there = d + length;
       if (!is_inside(u, v) || !(there < distance[u])) continue;
       distance[u] = there;
       queue.emplace(there, u);
@@ -240,16 +238,13 @@ Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplin
     ++graph.start[c.b + 1];
   }
   std::partial_sum(graph.start.begin(), graph.start.end(), graph.start.begin());
-  graph.neighbour.resize(2 * couplings.size());
-  graph.length.resize(2 * couplings.size());
+  graph.edge.resize(2 * couplings.size());
   std::vector<std::int32_t> next(graph.start.begin(), graph.start.end() - 1);
   for (const Coupling& c : couplings) {
     const double length = c.distance / std::clamp(c.strength / quartile, weakest, 1.0);
     graph.longest = std::max(graph.longest, length);
-    for (const auto& [from, to] : {std::pair{c.a, c.b}, std::pair{c.b, c.a}}) {
-      graph.neighbour[next[from]] = to;
-      graph.length[next[from]++] = length;
-    }
+    graph.edge[next[c.a]++] = {length, c.b};
+    graph.edge[next[c.b]++] = {length, c.a};
   }
   return graph;
 }

@@ -14,11 +14,19 @@ struct Coupling {
   double strength, distance;
 };
 
-// Neighbours and lengths of the edges; weak ones are long.
+// The edges of each vertex; weak ones are long.
 struct Graph {
-  std::vector<std::int32_t> start, neighbour;
-  std::vector<double> length;
+  struct Edge {
+    double length;
+    std::int32_t neighbour;
+  };
+  std::vector<std::int32_t> start;
+  std::vector<Edge> edge;
   double longest = 0;
+
+  std::span<const Edge> edges(std::int32_t vertex) const {
+    return {edge.data() + start[vertex], edge.data() + start[vertex + 1]};
+  }
 
   std::int32_t vertices() const { return std::int32_t(start.size()) - 1; }
 };
