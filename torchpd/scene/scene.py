@@ -150,8 +150,8 @@ class Scene:
         return self._tets_of(self.solids)
 
     def _tets_of(self, solids: Iterable[Solid]) -> Index:
-        own = (solid.mesh.tets + self.vertex_range(solid).start for solid in solids)
-        return np.concatenate([np.zeros((0, 4), dtype=np.int64), *own])
+        own = [solid.mesh.tets + self.vertex_range(solid).start for solid in solids]
+        return own[0] if len(own) == 1 else np.concatenate([np.zeros((0, 4), dtype=np.int64), *own])
 
     @property
     def pins(self) -> tuple[Pin, ...]:
