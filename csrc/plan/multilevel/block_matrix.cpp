@@ -36,7 +36,7 @@ struct Left {
 template <int H, int K, bool Transposed>
 BlockMatrix product(const Left& a, const BlockMatrix& b, int threads) {
   BlockMatrix c{H, width, a.rows, b.columns, {}, {}, {}};
-  make_rows(c, 0.0, threads, [&](std::int32_t row, RowSum& sum) {
+  sum_rows(c, 0.0, threads, [&](std::int32_t row, RowSum& sum) {
     for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
       const std::int64_t block = Transposed ? a.block[p] : p;
       for (std::int32_t q = b.start[a.column[p]]; q < b.start[a.column[p] + 1]; ++q) {
@@ -51,11 +51,11 @@ BlockMatrix product(const Left& a, const BlockMatrix& b, int threads) {
 
 }  // namespace
 
-void join(BlockMatrix& m, std::vector<Rows>& batches, int threads) {
+void join_rows(BlockMatrix& m, std::vector<MatrixRows>& batches, int threads) {
   m.start.assign(1, 0);
   std::vector<std::int64_t> first;
   std::int64_t count = 0;
-  for (const Rows& rows : batches) {
+  for (const MatrixRows& rows : batches) {
     first.push_back(count);
     count += std::ssize(rows.column);
     if (count > INT32_MAX)
@@ -65,7 +65,7 @@ void join(BlockMatrix& m, std::vector<Rows>& batches, int threads) {
   m.column.resize(count);
   m.value.resize(count * m.block());
   for_rows(std::ssize(batches), threads, [&](std::int64_t b) {
-    const Rows rows = std::move(batches[b]);
+    const MatrixRows rows = std::move(batches[b]);
     std::ranges::copy(rows.column, m.column.begin() + first[b]);
     std::ranges::copy(rows.value, m.value.begin() + first[b] * m.block());
   });

@@ -20,7 +20,7 @@ struct BlockMatrix {
 };
 
 // Rows of a matrix, one after the other.
-struct Rows {
+struct MatrixRows {
   std::vector<std::int32_t> length, column;
   std::vector<double> value;
 };
@@ -45,7 +45,7 @@ class RowSum {
   }
 
   // Appends the row in ascending order and clears it.
-  void move_to(Rows& rows) {
+  void move_to(MatrixRows& rows) {
     std::sort(column_.begin(), column_.end());
     for (const std::int32_t column : column_) {
       const double* from = value_.data() + place_[column] * block_;
@@ -73,13 +73,13 @@ void for_rows(std::int64_t rows, int threads, Work work) {
 }
 
 // Joins the rows of `batches` in `m`. Throws std::invalid_argument for more entries than 32 bits count.
-void join(BlockMatrix& m, std::vector<Rows>& batches, int threads);
+void join_rows(BlockMatrix& m, std::vector<MatrixRows>& batches, int threads);
 
 // Makes the rows of `m`: fill(row, sum) adds up each one.
 template <class Fill>
-void make_rows(BlockMatrix& m, double zero, int threads, Fill fill) {
+void sum_rows(BlockMatrix& m, double zero, int threads, Fill fill) {
   constexpr std::int64_t batch = 2048;
-  std::vector<Rows> batches((m.rows + batch - 1) / batch);
+  std::vector<MatrixRows> batches((m.rows + batch - 1) / batch);
   run_team(threads, [&](const Team& team) {
     RowSum sum(m.columns, m.block(), zero);
     for (std::int64_t b = team.begin(std::ssize(batches)); b < team.end(std::ssize(batches)); ++b) {
@@ -90,7 +90,7 @@ void make_rows(BlockMatrix& m, double zero, int threads, Fill fill) {
       }
     }
   });
-  join(m, batches, threads);
+  join_rows(m, batches, threads);
 }
 
 // a b, a of square blocks of 1 or 4, b of width 4. Every row adds up in the same order for any number of threads.

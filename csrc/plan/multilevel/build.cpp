@@ -3,20 +3,19 @@
 #include "plan/multilevel/aggregate.h"
 #include "plan/multilevel/block_matrix.h"
 #include "plan/multilevel/fine_matrix.h"
-#include "solver/multilevel/lbfgs.h"
+#include "plan/multilevel/prolongation.h"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <functional>
 #include <numeric>
-#include <stdexcept>
 #include <utility>
 
 namespace pd {
 
 namespace {
 
-constexpr int functions = 4;                        // 1, x, y, z
 constexpr int most_coarse_nodes = 256;              // 1024 unknowns of the dense level
 constexpr std::int32_t most_of_two_levels = 12000;  // two levels serve up to so many free vertices
 constexpr double fine_smoothing = 1.14, middle_smoothing = 1.333;  // omega of I - omega D^-1 A
@@ -24,7 +23,6 @@ constexpr double weakest_coupling = 0.02;  // relative to the scaled blocks of m
 constexpr int turning_groups = 4;          // as in solver/multilevel/deflation.h
 constexpr double turning_reach = 2;        // overlap of groups, in mean depths of their vertices
 constexpr double coarse_shift = 1e-12;  // relative to the diagonal: above the rounding of a pivot
-constexpr double dependent = 1e-8;      // orthogonalisation leaves less of a dependent column
 
 // Diagonal of a matrix of square blocks.
 std::vector<double> diagonal(const BlockMatrix& a) {
@@ -76,85 +74,6 @@ std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>&
     });
   });
   return found;
-}
-
-// Orthonormalises the four columns of q [rows, 4]; a dependent column becomes zero. Returns R of the factorisation q
-// R.
-std::array<double, 16> orthonormalise(std::vector<double>& q) {
-  std::array<double, 16> r{};
-  const std::size_t rows = q.size() / functions;
-  const auto dot = [&](int a, int b) {
-    double sum = 0;
-    for (std::size_t i = 0; i < rows; ++i) sum += q[i * functions + a] * q[i * functions + b];
-    return sum;
-  };
-  for (int c = 0; c < functions; ++c) {
-    const double before = std::sqrt(dot(c, c));
-    // twice is enough (Kahan and Parlett)
-    for (int pass = 0; pass < 2; ++pass) {
-      for (int k = 0; k < c; ++k) {
-        const double part = dot(k, c);
-        r[k * functions + c] += part;
-        for (std::size_t i = 0; i < rows; ++i) q[i * functions + c] -= part * q[i * functions + k];
-      }
-    }
-    const double left = std::sqrt(dot(c, c)), scale = left > dependent * before ? 1 / left : 0;
-    r[c * functions + c] = scale > 0 ? left : 0;
-    for (std::size_t i = 0; i < rows; ++i) q[i * functions + c] *= scale;
-  }
-  return r;
-}
-
-// The tentative prolongation: candidates [rows, height, 4], made orthonormal on each aggregate.
-struct Tentative {
-  BlockMatrix prolongation;     // one block a row
-  std::vector<double> reduced;  // R [aggregates, 4, 4]: the candidates of the next level
-};
-
-Tentative tentative(const std::vector<double>& candidates, int height, const Aggregates& groups,
-                    int threads) {
-  const std::int32_t rows = std::int32_t(groups.of.size());
-  const int block = height * functions;
-  Tentative t{{height, functions, rows, groups.count, {0}, {}, {}}, {}};
-  for (const std::int32_t g : groups.of) {
-    if (g >= 0) t.prolongation.column.push_back(g);
-    t.prolongation.start.push_back(std::int32_t(t.prolongation.column.size()));
-  }
-  t.prolongation.value.resize(t.prolongation.column.size() * block);
-  t.reduced.resize(std::size_t(groups.count) * functions * functions);
-  const Members members = members_of(groups);
-  for_rows(groups.count, threads, [&](std::int64_t g) {
-    std::vector<double> q;
-    for (const std::int64_t i : members.of(g))
-      q.insert(q.end(), candidates.begin() + i * block, candidates.begin() + (i + 1) * block);
-    std::ranges::copy(orthonormalise(q), t.reduced.begin() + g * functions * functions);
-    const double* own = q.data();
-    for (const std::int32_t i : members.of(g)) {
-      std::copy_n(own, block,
-                  t.prolongation.value.begin() + std::int64_t(t.prolongation.start[i]) * block);
-      own += block;
-    }
-  });
-  return t;
-}
-
-// (I - omega D^-1 A) P
-BlockMatrix smoothed(const BlockMatrix& a, const std::vector<double>& inverse, double omega,
-                     const BlockMatrix& p, int threads) {
-  BlockMatrix prolongation = multiply(a, p, threads);
-  const std::int64_t block = prolongation.block();
-  for_rows(prolongation.rows, threads, [&](std::int64_t row) {
-    for (std::int32_t e = prolongation.start[row]; e < prolongation.start[row + 1]; ++e) {
-      const bool own =
-          p.start[row] < p.start[row + 1] && p.column[p.start[row]] == prolongation.column[e];
-      for (std::int64_t k = 0; k < block; ++k) {
-        const double scale = omega * inverse[row * prolongation.height + k / functions];
-        const double kept = own ? p.value[p.start[row] * block + k] : 0;
-        prolongation.value[e * block + k] = kept - scale * prolongation.value[e * block + k];
-      }
-    }
-  });
-  return prolongation;
 }
 
 // 1 / (lambda_max diag A), with lambda_max of diag(A)^-1 A from power iteration plus 5 %; 0 where there is no
@@ -230,7 +149,7 @@ struct Affine {
 Affine affine(const MultilevelScene& s) {
   Affine result;
   result.position.reserve(s.elements.vertices);
-  result.candidates.reserve(functions * s.elements.vertices);
+  result.candidates.reserve(node_functions * s.elements.vertices);
   std::array<double, 3> low{}, high{};
   for (std::int64_t i = 0; i < s.elements.vertices; ++i) {
     const double* x = s.elements.positions + 3 * std::int64_t(s.vertex_order[i]);
@@ -262,60 +181,6 @@ std::vector<std::array<double, 3>> mean_positions(
     for (double& x : mean[g]) x /= count[g];
   }
   return mean;
-}
-
-// The prolongation from the level below, its transpose, and the Galerkin matrix of that level.
-struct Step {
-  BlockMatrix prolongation, image;  // P, A P
-  Transposed restriction;
-  BlockMatrix coarse;
-};
-
-Step coarsen(const BlockMatrix& matrix, const std::vector<double>& inverse, double omega,
-             const BlockMatrix& tentative_prolongation, int threads) {
-  Step step;
-  step.prolongation = smoothed(matrix, inverse, omega, tentative_prolongation, threads);
-  step.image = multiply(matrix, step.prolongation, threads);
-  step.restriction = transpose(step.prolongation);
-  step.coarse = multiply_transposed(step.prolongation, step.restriction, step.image, threads);
-  return step;
-}
-
-// row of m *= factor scale
-void scale_row(BlockMatrix& m, std::int64_t row, double factor, const std::vector<double>& scale) {
-  for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
-    for (std::int64_t k = 0; k < m.block(); ++k)
-      m.value[e * m.block() + k] *= factor * scale[row * m.height + k / m.width];
-  }
-}
-
-// row of sum += row of m, where `sum` has all blocks of m
-void add_row(BlockMatrix& sum, const BlockMatrix& m, std::int64_t row) {
-  std::int32_t to = sum.start[row];
-  for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
-    while (to < sum.start[row + 1] && sum.column[to] != m.column[e]) ++to;
-    if (to == sum.start[row + 1]) throw std::logic_error("a matrix level lacks its diagonal");
-    for (std::int64_t k = 0; k < m.block(); ++k)
-      sum.value[to * m.block() + k] += m.value[e * m.block() + k];
-  }
-}
-
-// Folds smoothing into the prolongation and its transpose, as a GPU needs it: (I - S A) P with a level's smoother
-// S = (keep first + second) D^-1 - second first D^-1 A D^-1.
-void fold(Step& step, const BlockMatrix& a, const std::vector<double>& inverse, int threads) {
-  constexpr double once = Smoother::keep * Smoother::first + Smoother::second;
-  constexpr double twice = Smoother::second * Smoother::first;
-  BlockMatrix scaled = step.image;
-  for_rows(a.rows, threads, [&](std::int64_t row) { scale_row(scaled, row, twice, inverse); });
-  BlockMatrix prolongation = multiply(a, scaled, threads);
-  for_rows(a.rows, threads, [&](std::int64_t row) {
-    scale_row(prolongation, row, 1, inverse);
-    scale_row(step.image, row, -once, inverse);
-    add_row(prolongation, step.image, row);
-    add_row(prolongation, step.prolongation, row);
-  });
-  step.prolongation = std::move(prolongation);
-  step.restriction = transpose(step.prolongation);
 }
 
 // The nodes below the middle level.
@@ -371,7 +236,7 @@ void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<dou
 }
 
 // Stores the transposed prolongation: with the places of its values in the other, or with the `values` themselves.
-void store_nodes(Step& step, bool values, Numbers& start, Numbers& row, Numbers& from,
+void store_nodes(Coarsening& step, bool values, Numbers& start, Numbers& row, Numbers& from,
                  std::vector<double>& value, int threads) {
   if (values) {
     const std::int64_t block = step.prolongation.block();
@@ -387,13 +252,56 @@ void store_nodes(Step& step, bool values, Numbers& start, Numbers& row, Numbers&
   row = std::move(step.restriction.column);
 }
 
-}  // namespace
+// A small mesh has no levels, but the inverse factor of its matrix.
+void store_direct(MultilevelTables& t, FineMatrix& fine, int threads) {
+  t.level_sizes[level_direct] = 1;
+  t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
+  t.fine_prolongation_start.assign(std::size_t(fine.matrix.rows) + 1, 0);
+  t.fine_node_start = {0};
+  store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+}
 
-MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
-                                  const std::function<void(double)>& progress) {
-  MultilevelTables t;
-  FineMatrix fine = assemble(scene, threads);
-  progress(0.2);
+// Whether the nodes of the free vertices need a level between them and the dense one.
+bool needs_middle(const Graph& graph, const Mask& held, std::int32_t free) {
+  return free > most_of_two_levels || connected_components(graph, held) > most_coarse_nodes;
+}
+
+// Stores the fine level; returns the matrix of the next.
+BlockMatrix add_fine_level(MultilevelTables& t, BlockMatrix& matrix, const BlockMatrix& tentative,
+                           bool folded, int threads) {
+  Coarsening step = coarsen(matrix, t.fine_inverse, fine_smoothing, tentative, threads);
+  if (folded) fold(step, matrix, t.fine_inverse, threads);
+  t.level_sizes[level_fine_prolongations] = step.prolongation.start.back();
+  t.level_sizes[level_fine_nodes] = tentative.columns;
+  store(matrix, t.fine_start, t.fine_column, t.fine_value);
+  store_nodes(step, folded, t.fine_node_start, t.fine_node_row, t.fine_node_prolongation,
+              t.fine_node_weight, threads);
+  store(step.prolongation, t.fine_prolongation_start, t.fine_prolongation_node,
+        t.fine_prolongation_weight);
+  return std::move(step.coarse);
+}
+
+// The same for the middle level, nodes at `position` with candidates [nodes, 4, 4].
+BlockMatrix add_middle_level(MultilevelTables& t, BlockMatrix matrix, const Positions& position,
+                             const std::vector<double>& candidates, bool folded, int threads) {
+  t.middle_inverse = scaled_inverse(matrix, threads);
+  const Aggregates groups = group_nodes(matrix, position, threads);
+  const Tentative last = tentative(candidates, node_functions, groups, threads);
+  Coarsening step = coarsen(matrix, t.middle_inverse, middle_smoothing, last.prolongation, threads);
+  if (folded) fold(step, matrix, t.middle_inverse, threads);
+  t.level_sizes[level_middle_entries] = matrix.start.back();
+  t.level_sizes[level_middle_prolongations] = step.prolongation.start.back();
+  t.level_sizes[level_middle_nodes] = groups.count;
+  store(matrix, t.middle_start, t.middle_column, t.middle_value);
+  store_nodes(step, folded, t.middle_node_start, t.middle_node_row, t.middle_node_prolongation,
+              t.middle_node_weight, threads);
+  store(step.prolongation, t.middle_prolongation_start, t.middle_prolongation_node,
+        t.middle_prolongation_weight);
+  return std::move(step.coarse);
+}
+
+// What does not depend on the levels.
+void store_reference(MultilevelTables& t, const MultilevelScene& scene, const FineMatrix& fine) {
   t.fine_inverse.resize(fine.bound.size());
   std::ranges::transform(fine.bound, t.fine_inverse.begin(),
                          [](double bound) { return bound > 0 ? 1 / bound : 0; });
@@ -403,64 +311,45 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
     t.reference_inertia.push_back(scene.inertia[scene.vertex_order[i]]);
   t.level_sizes.assign(level_size_count, 0);
   t.level_sizes[level_fine_entries] = fine.matrix.start.back();
+}
+
+}  // namespace
+
+MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
+                                  const std::function<void(double)>& progress) {
+  MultilevelTables t;
+  FineMatrix fine = assemble(scene, threads);
+  progress(0.2);
+  store_reference(t, scene, fine);
   const Affine rest = affine(scene);
   const Graph graph = coupling_graph(
       fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0, threads));
   if (scene.elements.vertices <= scene.most_direct) {
-    t.level_sizes[level_direct] = 1;
     t.turning_weight = turning_weights(graph, fine.held, rest.position);
-    t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
-    t.fine_prolongation_start.assign(std::size_t(scene.elements.vertices) + 1, 0);
-    t.fine_node_start = {0};
-    store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+    store_direct(t, fine, threads);
     progress(1.0);
     return t;
   }
   const auto free = std::int32_t(std::count(fine.held.begin(), fine.held.end(), 0));
-  const bool middle =
-      free > most_of_two_levels || connected_components(graph, fine.held) > most_coarse_nodes;
-  const std::int32_t nodes = std::max(1, free / (free < 1000 ? 15 : 30));
+  const bool middle = needs_middle(graph, fine.held, free);
   Aggregates groups;
   const std::array<std::function<void()>, 2> tasks = {
       [&] {
-        const std::int32_t wanted = middle ? nodes : std::min(nodes, most_coarse_nodes);
-        groups = aggregate(graph, fine.held, wanted, threads);
+        const std::int32_t nodes = std::max(1, free / (free < 1000 ? 15 : 30));
+        groups = aggregate(graph, fine.held, middle ? nodes : std::min(nodes, most_coarse_nodes),
+                           threads);
       },
       [&] { t.turning_weight = turning_weights(graph, fine.held, rest.position); }};
   run_team(std::min(threads, 2), [&](const Team& team) {
     for (int task = team.rank; task < 2; task += team.size) tasks[task]();
   });
   progress(0.5);
-
   const Tentative first = tentative(rest.candidates, 1, groups, threads);
-  Step step = coarsen(fine.matrix, t.fine_inverse, fine_smoothing, first.prolongation, threads);
-  if (scene.folded) fold(step, fine.matrix, t.fine_inverse, threads);
-  step.image = {};
-  t.level_sizes[level_fine_prolongations] = step.prolongation.start.back();
-  t.level_sizes[level_fine_nodes] = groups.count;
-  store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
-  store_nodes(step, scene.folded, t.fine_node_start, t.fine_node_row, t.fine_node_prolongation,
-              t.fine_node_weight, threads);
-  store(step.prolongation, t.fine_prolongation_start, t.fine_prolongation_node,
-        t.fine_prolongation_weight);
+  BlockMatrix coarse = add_fine_level(t, fine.matrix, first.prolongation, scene.folded, threads);
   progress(0.7);
-
-  BlockMatrix coarse = std::move(step.coarse);
   if (middle) {
-    t.middle_inverse = scaled_inverse(coarse, threads);
-    const Aggregates last = group_nodes(coarse, mean_positions(rest.position, groups), threads);
-    const Tentative second = tentative(first.reduced, functions, last, threads);
-    step = coarsen(coarse, t.middle_inverse, middle_smoothing, second.prolongation, threads);
-    if (scene.folded) fold(step, coarse, t.middle_inverse, threads);
-    t.level_sizes[level_middle_entries] = coarse.start.back();
-    t.level_sizes[level_middle_prolongations] = step.prolongation.start.back();
-    t.level_sizes[level_middle_nodes] = last.count;
-    store(coarse, t.middle_start, t.middle_column, t.middle_value);
-    store_nodes(step, scene.folded, t.middle_node_start, t.middle_node_row,
-                t.middle_node_prolongation, t.middle_node_weight, threads);
-    store(step.prolongation, t.middle_prolongation_start, t.middle_prolongation_node,
-          t.middle_prolongation_weight);
-    coarse = std::move(step.coarse);
+    coarse = add_middle_level(t, std::move(coarse), mean_positions(rest.position, groups),
+                              first.reduced, scene.folded, threads);
   }
   progress(0.8);
   t.coarse_factor = coarse_factor(coarse, {}, threads);

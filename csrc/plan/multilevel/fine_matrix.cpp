@@ -148,8 +148,8 @@ FineMatrix assemble(const MultilevelScene& scene, int threads) {
   const std::int32_t n = std::int32_t(scene.elements.vertices);
   const Assembly rows(scene, threads);
   FineMatrix fine{{1, 1, n, n, {}, {}, {}}, std::vector<double>(n), rows.held()};
-  make_rows(fine.matrix, -0.0, threads,
-            [&](std::int32_t row, RowSum& sum) { fine.bound[row] = rows.fill(row, sum); });
+  sum_rows(fine.matrix, -0.0, threads,
+           [&](std::int32_t row, RowSum& sum) { fine.bound[row] = rows.fill(row, sum); });
   return fine;
 }
 
