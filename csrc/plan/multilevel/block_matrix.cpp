@@ -16,7 +16,7 @@ constexpr int width = 4;  // of the right factor of a product
 
 // c += a b of blocks [H, K] and [K, 4]; a^T is stored if `Transposed`.
 template <int H, int K, bool Transposed>
-void add_product(const double* a, const double* b, double* c) {
+void add_product(const double* a, const double* b, double* __restrict c) {
   for (int i = 0; i < H; ++i) {
     for (int j = 0; j < K; ++j) {
       const double f = a[Transposed ? j * H + i : i * K + j];
@@ -36,13 +36,18 @@ struct Left {
 template <int H, int K, bool Transposed>
 BlockMatrix product(const Left& a, const BlockMatrix& b, int threads) {
   BlockMatrix c{H, width, a.rows, b.columns, {}, {}, {}};
-  sum_rows(c, 0.0, threads, [&](std::int32_t row, RowSum& sum) {
-    for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
-      const std::int64_t block = Transposed ? a.block[p] : p;
-      for (std::int32_t q = b.start[a.column[p]]; q < b.start[a.column[p] + 1]; ++q) {
-        add_product<H, K, Transposed>(a.value.data() + block * H * K,
-                                      b.value.data() + std::int64_t(q) * K * width,
-                                      sum.at(b.column[q]));
+  sum_rows(c, 0.0, threads, [&a, &b](std::int32_t row, RowSum& sum) {
+    const std::int32_t *const column = b.column.data(), *const start = b.start.data();
+    const double* const value = b.value.data();
+    const std::int32_t end = a.start[row + 1];
+    for (std::int32_t p = a.start[row]; p < end; ++p) {
+      const std::int64_t number = Transposed ? a.block[p] : p;
+      std::array<double, H * K> block;
+      std::copy_n(a.value.data() + number * H * K, H * K, block.begin());
+      const std::int32_t k = a.column[p], last = start[k + 1];
+      for (std::int32_t q = start[k]; q < last; ++q) {
+        add_product<H, K, Transposed>(block.data(), value + std::int64_t(q) * K * width,
+                                      sum.at(column[q]));
       }
     }
   });
