@@ -248,6 +248,17 @@ def test_compiling_twice_gives_the_same_plan(values: SceneValues) -> None:
     assert all(torch.equal(a, b) for a, b in zip(one.arrays, other.arrays, strict=True))
 
 
+def test_the_number_of_threads_changes_nothing(values: SceneValues) -> None:
+    plans, before = [], torch.get_num_threads()
+    for threads in (1, 3):
+        try:
+            torch.set_num_threads(threads)
+            plans.append(compile_plan(values, dtype=torch.float64, patch_size=16))
+        finally:
+            torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*(plan.arrays for plan in plans), strict=True))
+
+
 def test_large_meshes_show_progress(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     values = values_of("beam")
     monkeypatch.setattr("torchpd.plan.cpu_plan._WORTH_A_BAR", 1000)

@@ -1,4 +1,4 @@
-"""Memory available to the process: that of the machine, or the container limit, which psutil ignores."""
+"""Memory of the process, the container limit included, which psutil ignores; and slices of long arrays."""
 
 from __future__ import annotations
 
@@ -6,7 +6,14 @@ import os
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-__all__ = ["host_memory"]
+__all__ = ["chunks", "host_memory"]
+
+_CHUNK = 1 << 14  # rows
+
+
+def chunks(count: int) -> Iterator[slice]:
+    """Slices of a long array whose temporaries fit a cache."""
+    return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
 
 
 def host_memory(root: Path = Path("/")) -> int:

@@ -58,20 +58,27 @@ std::int32_t packed(std::int64_t low, std::int64_t high) {
   return std::int32_t(std::uint32_t(low) | std::uint32_t(high) << 16);
 }
 
-// Writes rest shapes and bounds of a pair in lane `lane` of `block`.
+// The tetrahedra of a block of pairs: the first of each pair, then the second.
+struct BlockTets {
+  std::array<RestShape, 2 * lanes> shape;
+  std::array<bool, 2 * lanes> traceless;
+};
+
+// Writes rest shapes of a pair in lane `lane` of `block`.
 void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, const Pair& pair,
-               double unit, std::int64_t block, std::int64_t lane) {
+               double unit, std::int64_t block, std::int64_t lane, BlockTets& tets) {
   std::array<std::int64_t, 5> vertex;
   for (int c = 0; c < 5; ++c) vertex[c] = patch.vertex[pair.corner[c]];
   double volume[2];
   for (int which = 0; which < 2; ++which) {
-    const Rest rest =
-        rest_of(mesh.elements.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
-    const bool traceless =
+    const std::int64_t place = which * lanes + lane;
+    const RestShape rest =
+        rest_shape(mesh.elements.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
+    tets.shape[place] = rest;
+    tets.traceless[place] =
         pair.tet[which] >= 0 && !mesh.elements.averaged.has_trace(pair.tet[which]);
-    plan.pair_bound[(2 * block + which) * lanes + lane] = traceless ? -rest.bound : rest.bound;
     if (!plan.pair_factor.empty())
-      plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
+      plan.pair_factor[2 * block * lanes + place] = unit * unit / (6 * rest.volume);
     volume[which] = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
   }
   if (plan.pair_rest.empty()) return;
@@ -84,10 +91,22 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, c
   }
 }
 
+void fill_bounds(DeviceMeshPlan& plan, std::int64_t block, const BlockTets& tets) {
+  for (std::size_t first = 0; first < tets.shape.size(); first += bound_lanes) {
+    std::array<RestShape, bound_lanes> shapes;
+    std::copy_n(tets.shape.begin() + first, bound_lanes, shapes.begin());
+    const std::array<double, bound_lanes> bounds = tet_bounds(shapes);
+    for (std::size_t i = 0; i < bound_lanes; ++i)
+      plan.pair_bound[2 * block * lanes + first + i] =
+          tets.traceless[first + i] ? -bounds[i] : bounds[i];
+  }
+}
+
 void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, int number,
                  double unit, EntryChoice& choice) {
   const std::int64_t first_block = plan.patch_block[number];
   const std::int64_t count = std::ssize(patch.pairs);
+  BlockTets tets;
   for (std::int64_t i = 0; i < patch.blocks() * lanes; ++i) {
     const std::int64_t block = first_block + i / lanes, lane = i % lanes;
     Pair pair = patch.pairs[std::min(i, count - 1)];
@@ -96,7 +115,8 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch,
       pair.tet = {-1, -1};
       forces = 0;
     }
-    fill_rest(plan, mesh, patch, pair, unit, block, lane);
+    fill_rest(plan, mesh, patch, pair, unit, block, lane, tets);
+    if (lane == lanes - 1) fill_bounds(plan, block, tets);
     if (!plan.pair_coupled.empty()) plan.pair_coupled[block * lanes + lane] = i < patch.coupled;
     for (int which = 0; which < 2; ++which) {
       const std::int32_t tet = pair.tet[which];
