@@ -42,7 +42,7 @@ HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of t
 STILL = 1e-7  # of the size of a body: a motion that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
 EARLY = 1e-3  # both, before the iterations
-SETTLED = 0.1  # of a motion: a next step with which friction radii follow; of these: a lag that ends the steps
+SETTLED = 0.1  # of a motion: a next step that ends it, once friction radii follow; of these: a lag made up at once
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
@@ -309,11 +309,10 @@ def _model_minimum(
         if motions.share(step) <= max(still, SETTLED * motions.share(motion)):
             lag = contacts.friction * trial.normal_forces() - radius
             left, size = np.linalg.norm(lag), np.linalg.norm(radius)
-            settled = left <= SETTLED * size
-            if left > behind * size:
-                radius = radius + (1.0 if settled else 0.5) * lag
-            if settled:
+            if left <= behind * size:
+                motion = motion + step
                 break
+            radius = radius + (1.0 if left <= SETTLED * size else 0.5) * lag
             continue
         way, linear, quadratic = jacobian @ step, float(force @ step), float(step @ hessian @ step)
         linear -= float((way * trial.forces(radius)).sum())

@@ -25,7 +25,7 @@ constexpr int most_motions = 10, most_steps = 12, most_cuts = 8, most_searches =
 constexpr double still_share = 1e-7, lag_share = 1e-6;
 // The same of both, before the iterations.
 constexpr double early_share = 1e-3;
-// Of a motion: a next step with which it ends, once radii are renewed. Of these: a lag that lets it end.
+// Of a motion: a next step with which it ends, once radii have followed. Of these: a lag that they make up at once.
 constexpr double settled_share = 0.1;
 // Of the energy that moves a body by its size: a rise that is rounding.
 constexpr double energy_rounding = 1e-14;
@@ -119,13 +119,8 @@ class CoarseBody {
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
-    return {accepted_.turn,
-            trial_.turn,
-            body_.center,
-            accepted_.shift,
-            trial_.shift,
-            finite_ ? 1.0 : 0.0,
-            renews_ ? (ends_ ? 1.0 : 0.5) : 0.0};
+    return {accepted_.turn, trial_.turn,         body_.center, accepted_.shift,
+            trial_.shift,   finite_ ? 1.0 : 0.0, renews_};
   }
 
   // All passes of a body without contacts: there the first order is exact.
@@ -142,9 +137,9 @@ class CoarseBody {
 
   template <class Terms = CoarseTerms>
   PD_HD void pass(const double (&sum)[ContactSums::count]) {
-    const Next next = finite_   ? end_motion<Terms>(sum)
-                      : renews_ ? renewed<Terms>(sum)
-                                : go_on<Terms>(sum);
+    const Next next = finite_       ? end_motion<Terms>(sum)
+                      : renews_ > 0 ? decide<Terms>(sum)
+                                    : go_on<Terms>(sum);
     if (next == Next::step) try_step();
     if (next == Next::motion) try_motion();
   }
@@ -208,16 +203,10 @@ class CoarseBody {
     return decide<Terms>(sum);
   }
 
-  // After a pass that has renewed radii.
-  template <class Terms>
-  PD_HD Next renewed(const double (&sum)[ContactSums::count]) {
-    renews_ = false;
-    return ends_ ? Next::motion : decide<Terms>(sum);
-  }
-
-  // From the sums at the twist: Newton's next step; where that is small, radii are renewed, and the motion ends.
+  // From the sums at the twist: Newton's next step; where that is small, radii are renewed, or it ends the motion.
   template <class Terms>
   PD_HD Next decide(const double (&sum)[ContactSums::count]) {
+    renews_ = 0;
     if (++steps_ > most_steps) return Next::motion;
     Terms terms = terms_at<Terms>(twist_, sum);
     terms.solve(step_);
@@ -226,10 +215,13 @@ class CoarseBody {
     const double least = still_ * size_, part = settled_share * length_of(twist_);
     if (length_of(step_) > (least > part ? least : part)) return Next::step;
     const double lag = sum[ContactSums::lag], radius = sum[ContactSums::radius];
-    ends_ = lag <= settled_share * settled_share * radius;
-    renews_ = lag > lag_ * lag_ * radius;
+    if (lag <= lag_ * lag_ * radius) {
+      for (int i = 0; i < 6; ++i) twist_[i] += step_[i];
+      return Next::motion;
+    }
+    renews_ = lag <= settled_share * settled_share * radius ? 1.0 : 0.5;
     share_ = 0;  // a pass at the twist
-    return renews_ ? Next::step : Next::motion;
+    return Next::step;
   }
 
   // entry n of a vector; a group of threads has different n, and keeps the vector in registers
@@ -341,7 +333,8 @@ class CoarseBody {
   double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
   double contact_energy_ = 0;
   int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
-  bool finite_ = true, ends_ = false, renews_ = false, done_ = true;
+  double renews_ = 0;  // share by which the pass moves radii toward friction l
+  bool finite_ = true, done_ = true;
 };
 
 // One of the two first iterates of a step, at a vertex: its displacement before and after the correction, and the motion of
