@@ -128,8 +128,10 @@ class CoarseBody {
   PD_HD void move_free() {
     const double none[ContactSums::count] = {};
     while (!done_) {
-      if (end_motion<Terms>(none) == Next::step) {
-        for (int i = 0; i < 6; ++i) twist_[i] = step_[i];
+      Next next = end_motion<Terms>(none);
+      while (next == Next::step) {
+        for (int i = 0; i < 6; ++i) twist_[i] += step_[i];
+        next = decide<Terms>(none);
       }
       try_motion();
     }
