@@ -244,7 +244,7 @@ constexpr int part_slot_array = int(DevicePlanArray::part_slot);
 // Lengths of the arrays, by the names in gpu_plan.def.
 struct DevicePlanRows {
   std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
-      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part,
+      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, part, level_end, sum, piece,
       stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex,
       coupled_block;
 };
@@ -359,8 +359,10 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.part_patch_end = pieces ? plan.patches + 1 : 0;
   count.part_end = pieces ? plan.parts + 1 : 0;
   count.part_slot = pieces ? arrays[part_slot_array].size(0) : 0;
-  count.piece_end = pieces ? plan.pieces + 1 : 0;
   count.part = plan.parts;
+  count.level_end = pieces ? plan.sum_levels + 1 : 0;
+  count.sum = plan.sums;
+  count.piece = plan.pieces;
   const bool computed = plan.kernel == stream, fixed = computed && sizeof(T) == 4;
   count.stored_block = computed ? 0 : plan.blocks;
   count.rest_slot = computed && !fixed ? plan.slots : 0;

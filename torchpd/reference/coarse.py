@@ -39,7 +39,7 @@ OUTER = 10  # finite motions
 PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-STILL = 1e-7  # of the size of a body: a motion that ends the passes
+STILL = 1e-7  # of the size of a body: a step that may be left
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
 EARLY = 1e-3  # both, before the iterations
 SETTLED = 0.1  # of a motion: a next step that ends it, once friction radii follow; of these: a lag made up at once
@@ -266,9 +266,12 @@ def _correct_island(
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
     still, behind = (EARLY, EARLY) if early else (STILL, LAG)
+    phi = motions.energy + contacts.energy(radius)
     for _ in range(OUTER):
         motion, radius = _model_minimum(motions, contacts, radius, still, behind)
-        phi = energy = motions.energy + contacts.energy(radius)
+        if not motion.any():
+            break
+        energy = motions.energy + contacts.energy(radius)
         for _ in range(CUTS + 1):
             trial = motions.after(motion)
             after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
@@ -279,11 +282,7 @@ def _correct_island(
             motion = 0.5 * motion
         else:
             break
-        share = motions.share(motion)
         motions, contacts, phi = trial, after, reached
-        lag = contacts.friction * contacts.normal_forces() - radius
-        if share <= still and np.linalg.norm(lag) <= behind * np.linalg.norm(radius):
-            break
     return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
@@ -293,7 +292,8 @@ def _model_minimum(
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
     Newton's steps, each ended where the model is least along it. Where the next one is small beside the motion, radii
-    go half way to friction l, unless they are near: what friction does to normal forces may drive them up and down.
+    go half way to friction l, unless they are near: what friction does to normal forces may drive them up and down. No
+    motion where the first step is small.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -310,7 +310,7 @@ def _model_minimum(
             lag = contacts.friction * trial.normal_forces() - radius
             left, size = np.linalg.norm(lag), np.linalg.norm(radius)
             if left <= behind * size:
-                motion = motion + step
+                motion = motion + step if motion.any() else motion
                 break
             radius = radius + (1.0 if left <= SETTLED * size else 0.5) * lag
             continue

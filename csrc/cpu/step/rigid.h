@@ -68,7 +68,7 @@ CoarseVertex<typename Lanes::Wide> coarse_vertex(const Workspace<Lanes>& w, std:
   const Wide none(0.0), inverse = Lanes::widen(w.inverse[i]);
   const auto moves = inverse > none;
   return {widened<Wide>(Lanes::vec3(w.x[i])), widened<Wide>(Lanes::vec3(w.u[i])),
-          select(moves, Wide(1.0) / select(moves, inverse, Wide(1.0)), none)};
+          select(moves, Wide(1.0) / select(moves, inverse, Wide(1.0)), none), inverse};
 }
 
 template <class Lanes>
@@ -133,7 +133,8 @@ void find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
     read_lane<RigidSums::count, Lanes>(w.body_sums[n / lanes].rigid, n % lanes, sum);
     w.bodies[n] = CoarseBody(RigidBody(sum), early);
     put_lane<Lanes>(w.body_sums[n / lanes].moves, n % lanes, w.bodies[n].moves() ? 1.0 : 0.0);
-    if constexpr (!HasContacts) w.bodies[n].move_free();
+    const double none[ContactSums::count] = {};
+    while (!HasContacts && !w.bodies[n].is_done()) w.bodies[n].pass(none);
   }
   bool some = HasContacts;
   while (some) {
@@ -146,8 +147,10 @@ void find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
     if (!some) break;
     each_in_a_body<Lanes>(plan, [&](int i, int g) {
       if (!w.body_sums[g].goes_on) return;
-      add_contacts(w.body_sums[g].contact, contacts, coarse_vertex(w, i), w.trial[g],
-                   VertexForces<Lanes>{w, plan.vertices, i});
+      each_contact_term(contacts, coarse_vertex(w, i), w.trial[g],
+                        VertexForces<Lanes>{w, plan.vertices, i}, [&](bool adds, const auto& terms) {
+                          if (adds) add_terms(w.body_sums[g].contact, terms());
+                        });
     });
     for (int n = 0; n < plan.components * lanes; ++n) {
       if (w.bodies[n].is_done()) continue;

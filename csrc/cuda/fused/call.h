@@ -24,7 +24,7 @@ struct FusedScratch {
   Quad<T>* vertex[vertex_arrays];  // [teams, slots]; arrays outside shared memory
   T* weights;                      // [teams, blocks, pair_weights, 32]
   Piece* pieces;                   // [teams, patches, pieces]
-  // [teams, parts, PartSums::count]; a part holds the vertices of a piece that a patch owns
+  // [teams, count_rows, PartSums::count]
   double* part_sum;
   TaggedWord* messages;     // grid: [teams, 2, slots, words] forces on shared vertices
   TaggedWord* sums;         // grid: [teams, 2, patches, sums_count]

@@ -28,14 +28,21 @@ class FusedRounds {
 
   template <Round What>
   PD_DEVICE void find() {
-    if constexpr (Kind != Blocks::one) sums.sync();  // all blocks have read the previous sums
+    // all blocks have read the previous rows of parts
+    if (Kind != Blocks::one && plan.sum_levels == 0) sums.sync();
     const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
     const int end = plan.patch_part[index + 1];
     for (int n = plan.patch_part[index] + warp; n < end; n += warps) {
       const Part part(plan, n, false, -plan.patch_slot[index]);
-      sum_part<What>(of, plan, part, pieces[part.piece(plan)], part_sums + PartSums::count * n);
+      sum_part<What>(of, plan, part, pieces[part.piece(plan)], part_sums + PartSums::count * plan.part_row[n]);
     }
     sums.sync();
+    for (int level = 0; level < plan.sum_levels; ++level) {
+      const int first = plan.level_sum[level] + index * warps + warp;
+      for (int n = first; n < plan.level_sum[level + 1]; n += plan.patches * warps)
+        sum_rows<What>(plan, n, part_sums);
+      sums.sync();
+    }
     for (int n = warp; n < plan.pieces; n += warps)
       move_piece<What>(plan, n, of.contacts.exist(), of.is_early(), part_sums, pieces[n]);
     __syncthreads();

@@ -243,7 +243,7 @@ class FusedRunner {
     return memory_.pieces[(std::int64_t(team_) * plan_.patches + index_) * plan_.pieces + piece];
   }
   PD_DEVICE double* part_sums() const {
-    return memory_.part_sum + std::int64_t(team_) * plan_.parts * PartSums::count;
+    return memory_.part_sum + std::int64_t(team_) * count_rows(plan_) * PartSums::count;
   }
   PD_DEVICE TaggedWord* mailbox() const {
     return memory_.messages +

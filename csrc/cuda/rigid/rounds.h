@@ -1,9 +1,8 @@
-// The rounds of the coarse correction of solver/coarse: sums over a patch's part of a piece (one warp per
-// part), then over the parts (one warp per piece).
+// The rounds of the coarse correction of solver/coarse: sums over parts of pieces, a warp a part, and of these up a tree, a
+// warp a sum; then one thread of a warp decides for a piece.
 #pragma once
 #include "cuda/common/reductions.h"
 #include "cuda/rigid/contact_forces.h"
-#include "cuda/rigid/warp_terms.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -32,7 +31,13 @@ PD_DEVICE bool has_whole_parts(const DevicePlan<T>& plan) {
   return plan.parts == plan.pieces;
 }
 
-// Slots of a part.
+// Rows of sums: of parts, and of sums of rows.
+template <class T>
+PD_HD std::int64_t count_rows(const DevicePlan<T>& plan) {
+  return std::int64_t(plan.parts) + plan.sums;
+}
+
+// Slots of a part, at most one a lane.
 struct Part {
   const int *slot, *vertex;
   int begin, end;
@@ -53,14 +58,25 @@ struct Part {
     return plan.slot_piece[slot[begin]];
   }
 
+  // the lane's, or if it has none the first
+  PD_DEVICE int own() const { return has_own() ? begin + lane() : begin; }
+  PD_DEVICE bool has_own() const { return begin + lane() < end; }
+
   // calls visit(place, vertex) on one lane each
   template <class Visit>
   PD_DEVICE void each(const Visit& visit) const {
-    for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size) {
-      const int number = vertex[slot[at]];
-      visit(first + (by_vertex ? number : slot[at]), number);
-    }
+    if (has_own()) visit_own(visit);
   }
+
+  // the same on all lanes
+  template <class Visit>
+  PD_DEVICE void visit_own(const Visit& visit) const {
+    const int at = slot[own()], number = vertex[at];
+    visit(first + (by_vertex ? number : at), number);
+  }
+
+ private:
+  PD_DEVICE static int lane() { return int(threadIdx.x) % warp_size; }
 };
 
 // Sums over a warp; lane n gets value n. Each exchange halves the number of values per lane.
@@ -89,6 +105,41 @@ PD_DEVICE double write_shares(const double (&value)[Count], double* to) {
   const double own = share_out(value);
   if (int(threadIdx.x) % warp_size < Count) to[int(threadIdx.x) % warp_size] = own;
   return own;
+}
+
+// The numbers that a round sums, in their order in PartSums.
+struct Range {
+  int begin, end;
+
+  template <class T>
+  PD_DEVICE Range(Round what, const DevicePlan<T>& plan)
+      : begin(what == Round::moments && !has_whole_parts(plan) ? RigidSums::target_offset : 0),
+        end(what == Round::mean       ? RigidSums::target_offset
+            : what == Round::moments  ? RigidSums::count
+            : what == Round::contacts ? ContactSums::count
+                                      : 1) {}
+  PD_DEVICE bool has(int n) const { return begin <= n && n < end; }
+};
+
+// Lane n gets the sum of number n over rows. It bypasses the L1 cache, which may not hold the writes
+// of other blocks.
+PD_DEVICE_COLD double sum_over_rows(Range range, const double* row, int begin, int end) {
+  const int lane = int(threadIdx.x) % warp_size;
+  double own = 0;
+#pragma unroll 8
+  for (int at = begin; at < end; ++at) {
+    if (range.has(lane)) own += __ldcg(row + std::int64_t(at) * PartSums::count + lane);
+  }
+  return own;
+}
+
+// Sum n of a tree. `row`: [count_rows, PartSums::count]
+template <Round What, class T>
+PD_DEVICE void sum_rows(const DevicePlan<T>& plan, int n, double* row) {
+  const Range range(What, plan);
+  const int lane = int(threadIdx.x) % warp_size;
+  const double own = sum_over_rows(range, row, plan.sum_rows[2 * n], plan.sum_rows[2 * n + 1]);
+  if (range.has(lane)) row[(std::int64_t(plan.parts) + n) * PartSums::count + lane] = own;
 }
 
 // The rounds that find the motions of all pieces. `run` takes the sums of a round, and knows whether
@@ -138,18 +189,24 @@ PD_DEVICE_COLD void sum_part(const Correction<T, HasContacts>& of, const DeviceP
       add_moments(sum, double(v.inertia(i)), at(i) - center, widened<double>(target_offset));
     });
     write_shares(sum, to + S::target_offset);
-    if (plan.pins == 0) return;
-    part.each([&](int i, int) { add_pin(held, double(v.inertia(i)), at(i) - center); });
+    if (plan.pins > 0)
+      part.each([&](int i, int) { add_pin(held, double(v.inertia(i)), at(i) - center); });
     write_shares(held, to + S::pins);
   } else if constexpr (What == Round::contacts) {
     if (piece.body.is_done()) return;
-    double sum[ContactSums::count] = {};
-    const CoarseTrial<double> trial = piece.body.trial();
-    part.each([&](int i, int vertex) {
-      add_contacts(sum, of.contacts, coarse_vertex(v.at(i), vec3(v.u[i])), trial,
-                   of.forces.at(vertex));
+    const int lane = int(threadIdx.x) % warp_size;
+    double own = 0;
+    part.visit_own([&](int i, int vertex) {
+      each_contact_term(of.contacts, coarse_vertex(v.at(i), vec3(v.u[i])), piece.body.trial(),
+                        of.forces.at(vertex), [&](bool adds, const auto& terms) {
+                          adds = adds && part.has_own();
+                          if (!__any_sync(full_warp, adds)) return;
+                          double sum[ContactSums::count] = {};
+                          if (adds) add_terms(sum, terms());
+                          own += share_out(sum);
+                        });
     });
-    write_shares(sum, to);
+    if (lane < ContactSums::count) to[lane] = own;
   } else {
     double sum[1] = {};
     part.each([&](int i, int vertex) {
@@ -159,82 +216,31 @@ PD_DEVICE_COLD void sum_part(const Correction<T, HasContacts>& of, const DeviceP
   }
 }
 
-// Value n of a part from `from` [parts, PartSums::count]. It bypasses the L1 cache, which may not
-// hold the writes of other blocks.
-template <class T>
-PD_DEVICE double read_part(const DevicePlan<T>& plan, const double* from, int at, int n) {
-  return __ldcg(from + PartSums::count * plan.piece_part[at] + n);
-}
-
-// Lane n gets value n summed over many parts; each lane reads every 32nd part.
-template <int Count, class T>
-PD_DEVICE_COLD double sum_over_many_parts(const DevicePlan<T>& plan, int begin, int end,
-                                          const double* from) {
-  double part[Count] = {};
-  for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size) {
-    for (int n = 0; n < Count; ++n) part[n] += read_part(plan, from, at, n);
-  }
-  return share_out(part);
-}
-
-// Sums Count values from `first` on over the parts of a piece, into memory that all lanes can read.
-// Broadcasts one by one would take longer. With few parts, each lane sums one value over all of them.
-template <int Count, class T>
-PD_DEVICE void sum_over_parts(const DevicePlan<T>& plan, int piece, const double* part_sum,
-                              int first, double* total) {
-  constexpr int few = 16;
-  const int lane = int(threadIdx.x) % warp_size;
-  const int begin = plan.piece_start[piece], end = plan.piece_start[piece + 1];
-  const double* from = part_sum + first;
-  double own = 0;
-  if (end - begin <= few) {
-    for (int at = begin; at < end && lane < Count; ++at) own += read_part(plan, from, at, lane);
-  } else {
-    own = sum_over_many_parts<Count>(plan, begin, end, from);
-  }
-  if (lane < Count) total[lane] = own;
-  __syncwarp();
-}
-
-// A body that all lanes change alike: each on its own copy.
-template <class Change>
-PD_DEVICE void of_the_warp(CoarseBody& body, const Change& change) {
-  CoarseBody copy = body;
-  change(copy);
-  __syncwarp();
-  if (threadIdx.x % warp_size == 0) body = copy;
-  __syncwarp();
-}
-
-// `part_sum`: [parts, PartSums::count]. A warp for a piece. `early`: before the iterations.
+// `row`: [count_rows, PartSums::count]. A warp for a piece. `early`: before the iterations.
 template <Round What, class T>
 PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts, bool early,
-                               const double* part_sum, Piece& to) {
-  using S = RigidSums;
-  const bool leader = threadIdx.x % warp_size == 0;
-  if constexpr (What == Round::mean) {
-    sum_over_parts<S::target_offset>(plan, piece, part_sum, 0, to.sum);
-  } else if constexpr (What == Round::moments) {
-    constexpr int moments = S::pins - S::target_offset, pins = S::count - S::pins;
-    if (has_whole_parts(plan)) sum_over_parts<S::target_offset>(plan, piece, part_sum, 0, to.sum);
-    sum_over_parts<moments>(plan, piece, part_sum, S::target_offset, to.sum + S::target_offset);
-    if (plan.pins > 0) sum_over_parts<pins>(plan, piece, part_sum, S::pins, to.sum + S::pins);
-    if (leader) {
-      for (int n = S::pins; n < S::count && plan.pins == 0; ++n) to.sum[n] = 0;
-      to.reached = to.body.reached();
-      to.motion_before = to.body.motion();
-      to.body = CoarseBody(RigidBody(to.sum), early);
-    }
-    __syncwarp();
-    if (!has_contacts) of_the_warp(to.body, [](CoarseBody& body) { body.move_free<WarpTerms>(); });
-  } else if constexpr (What == Round::contacts) {
+                               const double* row, Piece& to) {
+  const int lane = int(threadIdx.x) % warp_size;
+  if constexpr (What == Round::contacts) {
     if (to.body.is_done()) return;
-    sum_over_parts<ContactSums::count>(plan, piece, part_sum, 0, to.contact);
-    of_the_warp(to.body, [&](CoarseBody& body) { body.pass<WarpTerms>(to.contact); });
-  } else {
-    sum_over_parts<1>(plan, piece, part_sum, 0, &to.rise);
-    if (leader)
-      to.rise = piece < plan.solid_pieces ? to.rise + (to.body.reached() - to.reached) : -1;
+  }
+  const Range range(What, plan);
+  const int* of = plan.piece_rows + 2 * piece;
+  const double own = sum_over_rows(range, row, of[0], of[1]);
+  double* const total = What == Round::contacts ? to.contact : What == Round::rises ? &to.rise : to.sum;
+  if (range.has(lane)) total[lane] = own;
+  __syncwarp();
+  if (lane != 0) return;
+  if constexpr (What == Round::moments) {
+    to.reached = to.body.reached();
+    to.motion_before = to.body.motion();
+    to.body = CoarseBody(RigidBody(to.sum), early);
+    for (double& sum : to.contact) sum = 0;
+    while (!has_contacts && !to.body.is_done()) to.body.pass(to.contact);
+  } else if constexpr (What == Round::contacts) {
+    to.body.pass(to.contact);
+  } else if constexpr (What == Round::rises) {
+    to.rise = piece < plan.solid_pieces ? to.rise + (to.body.reached() - to.reached) : -1;
   }
 }
 

@@ -22,7 +22,7 @@ struct SmallBatchScratch {
   Quad<T>*x, *velocity;     // [blocks, per_block, slots]
   T* weights;               // [blocks, per_block, blocks of pairs, 2, 32] w V
   Piece* pieces;            // [blocks, per_block, pieces]
-  double* part_sum;         // [blocks, per_block, parts, PartSums::count]
+  double* part_sum;         // [blocks, per_block, count_rows, PartSums::count]
   ContactForces<T> forces;  // [blocks, per_block]
 };
 

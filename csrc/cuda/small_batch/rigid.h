@@ -18,9 +18,17 @@ struct SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread, FewRegister
       const Part part(r.plan_, item.at, false, item.environment * r.slots());
       const Piece& piece = r.piece(item.environment, part.piece(r.plan_));
       sum_part<What>(r.correction(item.environment, from), r.plan_, part, piece,
-                     r.part_sums(item.environment) + PartSums::count * item.at);
+                     r.part_sums(item.environment) + PartSums::count * r.plan_.part_row[item.at]);
     }
     __syncthreads();
+    for (int level = 0; level < r.plan_.sum_levels; ++level) {
+      const int first = r.plan_.level_sum[level], sums = r.plan_.level_sum[level + 1] - first;
+      for (int n = warp; n < r.here_ * sums; n += warps) {
+        const WorkItem item = r.item_of(n, sums);
+        sum_rows<What>(r.plan_, first + item.at, r.part_sums(item.environment));
+      }
+      __syncthreads();
+    }
     for (int n = warp; n < r.here_ * r.plan_.pieces; n += warps) {
       const WorkItem item = r.item_of(n, r.plan_.pieces);
       move_piece<What>(r.plan_, item.at, HasContacts, from != Iterate::last,

@@ -142,7 +142,7 @@ class SmallBatchRunner {
   }
   PD_DEVICE double* part_sums(int environment) const {
     return memory_.part_sum +
-           std::int64_t(first_of_block_ + environment) * plan_.parts * PartSums::count;
+           std::int64_t(first_of_block_ + environment) * count_rows(plan_) * PartSums::count;
   }
   PD_DEVICE Correction<T, HasContacts> correction(int environment, Iterate from) const {
     return {v_, contacts(environment), inputs(environment),

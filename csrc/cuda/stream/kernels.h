@@ -30,7 +30,7 @@ struct StreamMemory {
   Progress* progress;       // [batch]
   double* omega;            // [batch, guard_period] of the next iterations
   Piece* pieces;            // [batch, pieces]
-  double* part_sum;         // [batch, parts, PartSums::count]
+  double* part_sum;         // [batch, count_rows, PartSums::count]
   unsigned* counter;        // [batch] barrier counters of the teams that move pieces
   ContactForces<T> forces;  // [batch]
   Plane<T>* planes;         // [batch, planes]
@@ -114,7 +114,7 @@ struct StreamWork {
     return call.memory.pieces[environment * plan.pieces + piece];
   }
   PD_DEVICE double* part_sums() const {
-    return call.memory.part_sum + environment * plan.parts * PartSums::count;
+    return call.memory.part_sum + environment * count_rows(plan) * PartSums::count;
   }
   PD_DEVICE Correction<T, HasContacts> correction(Iterate from) const {
     return {v, contacts, in, call.memory.forces.of_environment(environment), from};

@@ -39,9 +39,15 @@ class StreamRounds {
   PD_DEVICE void find() {
     each_part([&](const Part& part, int n) {
       sum_part<What>(of_, w_.plan, part, w_.piece(part.piece(w_.plan)),
-                     w_.part_sums() + PartSums::count * n);
+                     w_.part_sums() + std::int64_t(w_.plan.part_row[n]) * PartSums::count);
     });
     team_.barrier();
+    for (int level = 0; level < w_.plan.sum_levels; ++level) {
+      const int first = w_.plan.level_sum[level] + team_.warp();
+      for (int n = first; n < w_.plan.level_sum[level + 1]; n += team_.warps())
+        sum_rows<What>(w_.plan, n, w_.part_sums());
+      team_.barrier();
+    }
     for (int n = team_.warp(); n < w_.plan.pieces; n += team_.warps())
       move_piece<What>(w_.plan, n, HasContacts, of_.is_early(), w_.part_sums(), w_.piece(n));
     team_.barrier();

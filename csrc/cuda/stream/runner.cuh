@@ -42,7 +42,7 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   arena.place(m.progress, step.batch);
   arena.place(m.omega, step.batch * guard_period);
   arena.place(m.pieces, step.batch * plan.pieces);
-  arena.place(m.part_sum, step.batch * plan.parts * PartSums::count);
+  arena.place(m.part_sum, step.batch * count_rows(plan) * PartSums::count);
   arena.place(m.counter, plan.pieces > 0 ? step.batch : 0);
   m.forces = arrange_contact_forces(arena, step, step.batch);
   arena.place(m.planes, step.batch * material.planes_count);

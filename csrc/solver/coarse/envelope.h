@@ -55,6 +55,8 @@ struct Envelope {
   };
 
   PD_HD Rub rub(const Vec3<W>& slip, const W& radius) const {
+    const W none(0.0);
+    if (!any(radius > none)) return {{none, none, none}, none, none};
     const Vec3<W> pull = subtract_product(tangent_anchor, stiffness, slip);
     const W square = dot(pull, pull), size = square_root(square);
     const W cut = radius / select(size > W(0.0), size, W(1.0));
@@ -66,11 +68,12 @@ struct Envelope {
     return multiply_add(normal_anchor, normal, tangent_anchor);
   }
 
+  // e, times D
   PD_HD W energy(const Surface<W>& at, const W& radius) const {
     const W normal = normal_force(at.gap);
     const Rub r = rub(at.slip, radius);
     const W huber = r.share * (W(1.0) - W(0.5) * r.share) * r.square;
-    return multiply_add(W(0.5) * normal, normal, huber) / stiffness;
+    return multiply_add(W(0.5) * normal, normal, huber);
   }
 
   PD_HD Vec3<W> force(const Surface<W>& at, const W& radius) const {
@@ -90,36 +93,49 @@ struct ContactSums {
   }
 };
 
-// Adds J^T k J and J^T f: k = `across` (1 - n n^T) + `along` n n^T, J the displacement of a vertex at `arm` by a twist, n = `normal`.
+// What a contact adds: its energies before and after a motion, friction l - r and r, and after it the force, and the stiffness
+// `across` (1 - n n^T) + `along` n n^T. `arm`: of its vertex, for the twist; n = `normal`.
 template <class W>
-PD_HD void add_twist_terms(W (&sum)[ContactSums::count], const Vec3<W>& arm, const Vec3<W>& normal,
-                           const Vec3<W>& force, const W& across, const W& along) {
+struct ContactTerms {
+  W before, after, lag, radius;
+  Vec3<W> arm, normal, force;
+  W across, along;
+};
+
+// Adds J^T k J and J^T f, J the displacement of the vertex by a twist.
+template <class W>
+PD_HD void add_terms(W (&sum)[ContactSums::count], const ContactTerms<W>& of) {
   using S = ContactSums;
-  const Vec3<W> moment = cross(arm, force), lever = cross(arm, normal);
-  const W f[6] = {force.x, force.y, force.z, moment.x, moment.y, moment.z};
-  const W n[6] = {normal.x, normal.y, normal.z, lever.x, lever.y, lever.z};
-  const W none(0.0), square = dot(arm, arm), r[3] = {arm.x, arm.y, arm.z};
+  sum[S::before] = sum[S::before] + of.before;
+  sum[S::after] = sum[S::after] + of.after;
+  sum[S::lag] = multiply_add(of.lag, of.lag, sum[S::lag]);
+  sum[S::radius] = multiply_add(of.radius, of.radius, sum[S::radius]);
+  const Vec3<W> moment = cross(of.arm, of.force), lever = cross(of.arm, of.normal);
+  const W f[6] = {of.force.x, of.force.y, of.force.z, moment.x, moment.y, moment.z};
+  const W n[6] = {of.normal.x, of.normal.y, of.normal.z, lever.x, lever.y, lever.z};
+  const W none(0.0), square = dot(of.arm, of.arm), r[3] = {of.arm.x, of.arm.y, of.arm.z};
   // arm x
-  const W x[3][3] = {{none, -arm.z, arm.y}, {arm.z, none, -arm.x}, {-arm.y, arm.x, none}};
-  const W more = along - across;
+  const W x[3][3] = {{none, -r[2], r[1]}, {r[2], none, -r[0]}, {-r[1], r[0], none}};
+  const W more = of.along - of.across;
   for (int i = 0; i < 6; ++i) {
     sum[S::force + i] = sum[S::force + i] + f[i];
     const W scaled = more * n[i];
     for (int j = 0; j <= i; ++j) {
-      const W plain = i < 3    ? (i == j ? across : none)
-                      : j < 3  ? across * x[i - 3][j]
-                      : i == j ? across * (square - r[i - 3] * r[i - 3])
-                               : -(across * (r[i - 3] * r[j - 3]));
+      const W plain = i < 3    ? (i == j ? of.across : none)
+                      : j < 3  ? of.across * x[i - 3][j]
+                      : i == j ? of.across * (square - r[i - 3] * r[i - 3])
+                               : -(of.across * (r[i - 3] * r[j - 3]));
       sum[S::at(i, j)] = multiply_add(scaled, n[j], sum[S::at(i, j)] + plain);
     }
   }
 }
 
-// A vertex of a body that moves, in double: its position at the start of the step, its displacement at the iterate, and D.
+// A vertex of a body that moves, in double: its position at the start of the step, its displacement at the iterate, D and
+// 1 / D, both 0 where a pin holds it.
 template <class W>
 struct CoarseVertex {
   Vec3<W> x, u;
-  W stiffness;  // 0: a pin holds it
+  W stiffness, inverse;
 };
 
 template <class W>
@@ -187,24 +203,22 @@ PD_HD void keep_forces(const Contacts<R>& contacts, const CoarseVertex<W>& v, co
 // Of these forces: sum |f0|^2 / (2 D), which Phi has more than the energy.
 template <class R, class W, class Forces>
 PD_HD W anchor_energy(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
-  const W none(0.0), one(1.0), stiffness = select(v.stiffness > none, v.stiffness, one);
   W square(0.0);
   for (int n = 0; n < contacts.plane_count + contacts.sphere_count; ++n)
     square = square + dot(forces.force(n), forces.force(n));
-  return W(0.5) * square / stiffness;
+  return W(0.5) * v.inverse * square;
 }
 
 // How far the contacts push a vertex once its body has moved, one after another: (f - f0) / D.
 template <class R, class W, class Forces>
 PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
-  const W none(0.0), one(1.0), stiffness = select(v.stiffness > none, v.stiffness, one);
-  const W inverse = select(v.stiffness > none, one / stiffness, none);
+  const W none(0.0);
   Vec3<W> push = {none, none, none};
   each_contact_in_turn<W>(
-      contacts, inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
+      contacts, v.inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
         const Surface<W> at = before_pushes(surface_at(shape, v.x, v.u + push), later);
-        const Envelope<W> envelope(stiffness, forces.force(n), at.normal);
-        push = push + inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
+        const Envelope<W> envelope(v.stiffness, forces.force(n), at.normal);
+        push = push + v.inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
       });
   return push;
 }
@@ -218,49 +232,55 @@ struct CoarseTrial {
   W finite, renews;  // 1 or 0; 1, 0.5 or 0
 };
 
-// Adds the contacts of a vertex. `forces[n stride]`: ContactForce of contact n.
-template <class R, class W, class Forces>
-PD_HD void add_contacts(W (&sum)[ContactSums::count], const Contacts<R>& contacts,
-                        const CoarseVertex<W>& v, const CoarseTrial<W>& trial,
-                        const Forces& forces) {
-  using S = ContactSums;
+// Calls add(whether a contact of a vertex adds anything, what it adds: a function).
+template <class R, class W, class Forces, class Add>
+PD_HD void each_contact_term(const Contacts<R>& contacts, const CoarseVertex<W>& v,
+                             const CoarseTrial<W>& trial, const Forces& forces, const Add& add) {
   const Vec3<W> arm = (v.x + v.u) - trial.center, turned = trial.turn_before * arm;
   const Vec3<W> first = v.u + (turned + trial.shift_before);
   const Vec3<W> way = trial.turn_after * arm, then = v.u + (way + trial.shift_after);
-  const W none(0.0), free = select(v.stiffness > none, W(1.0), none);
-  const W stiffness = select(v.stiffness > none, v.stiffness, W(1.0));
+  const W none(0.0);
   const auto finite = trial.finite > none;
-  const Vec3<W> lever = arm + select(finite, way, turned);
+  const Vec3<W> lever = arm + select(finite, way, turned), moved = then - first;
   each_contact_in_turn<W>(
-      contacts, free / stiffness, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
+      contacts, v.inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
         const Surface<W> before = before_pushes(surface_at(shape, v.x, first), later);
-        Surface<W> after = before_pushes(surface_at(shape, v.x, then), later);
-        const W friction = shape.friction;
-        const Vec3<W> force = forces.force(n), moved = then - first;
-        W radius = forces.radius(n);
         // by the normal of before, so that both energies are of one function
-        const Envelope<W> old(stiffness, force, before.normal);
-        const Surface<W> there = {before.normal,
-                                  select(finite, after.gap, before.gap + dot(before.normal, moved)),
-                                  before.slip + tangential(moved, before.normal)};
-        after = {select(finite, after.normal, there.normal), there.gap,
-                 select(finite, after.slip, there.slip)};
-        const Envelope<W> now(stiffness, force, after.normal);
+        Surface<W> there = {before.normal, before.gap + dot(before.normal, moved),
+                            before.slip + tangential(moved, before.normal)};
+        Surface<W> after = there;
+        if (any(finite)) {
+          const Surface<W> at = before_pushes(surface_at(shape, v.x, then), later);
+          there.gap = select(finite, at.gap, there.gap);
+          after = {select(finite, at.normal, there.normal), there.gap,
+                   select(finite, at.slip, there.slip)};
+        }
+        const Vec3<W> force = forces.force(n);
+        const W last_radius = forces.radius(n);
+        const Envelope<W> old(v.stiffness, force, before.normal),
+            now(v.stiffness, force, after.normal);
         const W normal = now.normal_force(after.gap);
-        if (!any(((old.normal_force(before.gap) + normal) + radius) + dot(force, force) > none))
-          return;
-        sum[S::before] = multiply_add(free, old.energy(before, radius), sum[S::before]);
-        sum[S::after] = multiply_add(free, old.energy(there, radius), sum[S::after]);
-        radius = multiply_add(trial.renews, friction * normal - radius, radius);
-        forces.set_radius(n, radius);
-        const W lag = friction * normal - radius;
-        sum[S::lag] = multiply_add(free * lag, lag, sum[S::lag]);
-        sum[S::radius] = multiply_add(free * radius, radius, sum[S::radius]);
-        const auto rub = now.rub(after.slip, radius);
-        const W across = free * (rub.share * stiffness);
-        const W along = select(normal > none, free * stiffness, none);
-        const Vec3<W> pull = free * multiply_add(normal, after.normal, rub.share * rub.pull);
-        add_twist_terms(sum, lever, after.normal, pull, across, along);
+        const W size = ((old.normal_force(before.gap) + normal) + last_radius) + dot(force, force);
+        add(any(size > none), [&] {
+          ContactTerms<W> terms{};  // first-order passes need no energies
+          if (any(finite)) {
+            terms.before = v.inverse * old.energy(before, last_radius);
+            terms.after = v.inverse * old.energy(there, last_radius);
+          }
+          const W free = select(v.stiffness > none, W(1.0), none);
+          const W radius =
+              multiply_add(trial.renews, shape.friction * normal - last_radius, last_radius);
+          forces.set_radius(n, radius);
+          terms.lag = free * (shape.friction * normal - radius);
+          terms.radius = free * radius;
+          const auto rub = now.rub(after.slip, radius);
+          terms.arm = lever;
+          terms.normal = after.normal;
+          terms.force = free * multiply_add(normal, after.normal, rub.share * rub.pull);
+          terms.across = rub.share * v.stiffness;
+          terms.along = select(normal > none, v.stiffness, none);
+          return terms;
+        });
       });
 }
 

@@ -3,8 +3,8 @@
 //
 // Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each
 // ended where Phi is least along it. Where the next one is small beside the motion, radii of friction go half way to friction
-// times l, or all the way if they are near. The motion is halved until Phi itself has not risen. A pass takes the contact sums
-// of one trial. Vertices are moved once, at the end.
+// times l, or all the way if they are near. The motion is halved until Phi itself has not risen. The passes end where no step
+// is left. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
 #include "solver/coarse/sums.h"
@@ -21,7 +21,7 @@ struct RigidMotion {
 };
 
 constexpr int most_motions = 10, most_steps = 12, most_cuts = 8, most_searches = 30;
-// Of the size of a body: a motion that ends the passes. Of the radii: how far behind friction l they may be left.
+// Of the size of a body: a step that is left. Of the radii: how far behind friction l they may be left.
 constexpr double still_share = 1e-7, lag_share = 1e-6;
 // The same of both, before the iterations.
 constexpr double early_share = 1e-3;
@@ -49,53 +49,7 @@ PD_HD bool is_positive(const Mat3<double>& a) {
          determinant(a) > 0;
 }
 
-// A symmetric 6 x 6 matrix, by its lower triangle, and as row 6 a right side; on one thread.
-class CoarseTerms {
- public:
-  static constexpr int count = 27;
-  PD_HD static constexpr int at(int row, int column) { return row * (row + 1) / 2 + column; }
-
-  // entry = of(number, row, column, entry)
-  template <class Of>
-  PD_HD void set(const Of& of) {
-    for (int r = 0, n = 0; r <= 6; ++r)
-      for (int c = 0; c <= r && c < 6; ++c, ++n) entry_[n] = of(n, r, c, entry_[n]);
-  }
-
-  // sum of of(row, column, entry)
-  template <class Of>
-  PD_HD double sum(const Of& of) const {
-    double sum = 0;
-    for (int r = 0, n = 0; r <= 6; ++r)
-      for (int c = 0; c <= r && c < 6; ++c, ++n) sum = sum + of(r, c, entry_[n]);
-    return sum;
-  }
-
-  // x with A x = b for an A that is not negative, 0 along rows without pivot: A = L D L^T. Entries are lost.
-  PD_HD void solve(double (&x)[6]) {
-    double most = 0, inverse[6];
-    for (int i = 0; i < 6; ++i) most = entry_[at(i, i)] > most ? entry_[at(i, i)] : most;
-    for (int j = 0; j < 6; ++j) {
-      const double pivot = entry_[at(j, j)];
-      inverse[j] = pivot > no_pivot * most ? 1.0 / pivot : 0.0;
-      for (int c = j + 1; c < 6; ++c) {
-        const double factor = inverse[j] * entry_[at(c, j)];
-        for (int r = c; r <= 6; ++r)
-          entry_[at(r, c)] = subtract_product(entry_[at(r, c)], factor, entry_[at(r, j)]);
-      }
-    }
-    for (int j = 5; j >= 0; --j) {
-      x[j] = inverse[j] * entry_[at(6, j)];
-      for (int c = 0; c < j; ++c)
-        entry_[at(6, c)] = subtract_product(entry_[at(6, c)], entry_[at(j, c)], x[j]);
-    }
-  }
-
- private:
-  double entry_[count] = {};
-};
-
-// The passes of one body. `Terms`: CoarseTerms, or the same of a group of threads that all call with equal arguments.
+// The passes of one body.
 class CoarseBody {
  public:
   CoarseBody() = default;
@@ -123,32 +77,19 @@ class CoarseBody {
             trial_.shift,   finite_ ? 1.0 : 0.0, renews_};
   }
 
-  // All passes of a body without contacts: there the first order is exact.
-  template <class Terms = CoarseTerms>
-  PD_HD void move_free() {
-    const double none[ContactSums::count] = {};
-    while (!done_) {
-      Next next = end_motion<Terms>(none);
-      while (next == Next::step) {
-        for (int i = 0; i < 6; ++i) twist_[i] += step_[i];
-        next = decide<Terms>(none);
-      }
-      try_motion();
-    }
-  }
-
-  template <class Terms = CoarseTerms>
   PD_HD void pass(const double (&sum)[ContactSums::count]) {
-    const Next next = finite_       ? end_motion<Terms>(sum)
-                      : renews_ > 0 ? decide<Terms>(sum)
-                                    : go_on<Terms>(sum);
-    if (next == Next::step) try_step();
-    if (next == Next::motion) try_motion();
+    if (finite_ && !accept(sum)) return;
+    double terms[terms_count];
+    find_terms(sum, terms);
+    if (share_ > 0 && !ends_step(terms)) return try_step();
+    for (int i = 0; i < 6; ++i) twist_[i] = multiply_add(share_, step_[i], twist_[i]);
+    decide(terms, sum[ContactSums::lag], sum[ContactSums::radius]);
   }
 
  private:
-  // What follows a pass: nothing, a trial of a step, or a finite motion.
-  enum class Next { none, step, motion };
+  // A symmetric 6 x 6 matrix by its lower triangle, row by row, and as row 6 a right side.
+  static constexpr int terms_count = 27;
+  PD_HD static constexpr int at(int row, int column) { return row * (row + 1) / 2 + column; }
 
   // Of the quadratics, relative to no motion.
   PD_HD double energy(const RigidMotion<double>& motion) const {
@@ -156,85 +97,68 @@ class CoarseBody {
            frobenius(motion.turn, body_.covariance);
   }
 
-  // After the pass of a finite motion: accepts it, or halves its twist.
-  template <class Terms>
-  PD_HD Next end_motion(const double (&sum)[ContactSums::count]) {
+  // After the pass of a finite motion: halves its twist, or accepts it, and whether the passes go on from there.
+  PD_HD bool accept(const double (&sum)[ContactSums::count]) {
     using S = ContactSums;
     const double before = energy(accepted_) + sum[S::before],
                  after = energy(trial_) + sum[S::after];
     if (!(after <= before + energy_rounding * (body_.weight * body_.square + sum[S::before]))) {
       done_ = ++cuts_ > most_cuts;
       for (double& number : twist_) number *= 0.5;
-      return done_ ? Next::none : Next::motion;
+      if (!done_) try_motion();
+      return false;
     }
     accepted_ = trial_;
     contact_energy_ = sum[S::after];
-    cuts_ = 0;
-    const bool still =
-        length_of(twist_) <= still_ * size_ && sum[S::lag] <= lag_ * lag_ * sum[S::radius];
-    done_ = (motions_ > 0 && still) || ++motions_ > most_motions;
-    if (done_) return Next::none;
+    done_ = ++motions_ > most_motions;
+    if (done_) return false;
     find_quadratics();
     for (double& number : twist_) number = 0;
-    steps_ = 0;
-    return decide<Terms>(sum);
+    share_ = 0;
+    steps_ = cuts_ = 0;
+    return true;
   }
 
-  // After a pass to first order: ends the step, or goes on to where Phi is least along it.
-  template <class Terms>
-  PD_HD Next go_on(const double (&sum)[ContactSums::count]) {
-    double at[6];
-    for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
-    const Terms terms = terms_at<Terms>(at, sum);
-    const double slope = -terms.sum(
-        [&](int r, int c, double entry) { return r < 6 ? 0.0 : entry * pick(step_, c); });
-    const double second = terms.sum([&](int r, int c, double entry) {
-      return r < 6 ? (r == c ? 1.0 : 2.0) * entry * (pick(step_, r) * pick(step_, c)) : 0.0;
-    });
+  // Whether Phi to first order is least here along the step; else how much of it to try next.
+  PD_HD bool ends_step(const double (&terms)[terms_count]) {
+    double slope = 0, second = 0;
+    PD_UNROLL
+    for (int r = 0; r < 6; ++r) {
+      double product = 0;
+      PD_UNROLL
+      for (int c = 0; c < 6; ++c)
+        product = multiply_add(terms[c < r ? at(r, c) : at(c, r)], step_[c], product);
+      second = multiply_add(product, step_[r], second);
+      slope = subtract_product(slope, terms[at(6, r)], step_[r]);
+    }
     // the slope rises: Newton's step within the bracket, or its middle
     (slope < 0 ? low_ : high_) = share_;
     double next = share_ - slope / second;
     if (next != share_ && !(low_ < next && next < high_)) next = 0.5 * (low_ + high_);
-    const bool ends = (share_ == 1.0 && !(slope > 0)) ||
-                      absolute(next - share_) * length_of(step_) <= exact_share * size_;
-    if (!ends && ++searches_ <= most_searches) {
-      share_ = next;
-      return Next::step;
-    }
-    for (int i = 0; i < 6; ++i) twist_[i] = at[i];
-    return decide<Terms>(sum);
+    if ((share_ == 1.0 && !(slope > 0)) ||
+        absolute(next - share_) * length_of(step_) <= exact_share * size_ ||
+        ++searches_ > most_searches)
+      return true;
+    share_ = next;
+    return false;
   }
 
-  // From the sums at the twist: Newton's next step; where that is small, radii are renewed, or it ends the motion.
-  template <class Terms>
-  PD_HD Next decide(const double (&sum)[ContactSums::count]) {
+  // From the terms at the twist: Newton's next step; where that is small, radii are renewed, or it ends the motion.
+  PD_HD void decide(double (&terms)[terms_count], double lag, double radius) {
     renews_ = 0;
-    if (++steps_ > most_steps) return Next::motion;
-    Terms terms = terms_at<Terms>(twist_, sum);
-    terms.solve(step_);
+    if (++steps_ > most_steps) return try_motion();
+    solve(terms);
     searches_ = 0;
     low_ = 0, high_ = share_ = 1;
-    const double least = still_ * size_, part = settled_share * length_of(twist_);
-    if (length_of(step_) > (least > part ? least : part)) return Next::step;
-    const double lag = sum[ContactSums::lag], radius = sum[ContactSums::radius];
+    const double moved = length_of(twist_), least = still_ * size_, part = settled_share * moved;
+    if (length_of(step_) > (least > part ? least : part)) return try_step();
     if (lag <= lag_ * lag_ * radius) {
-      for (int i = 0; i < 6; ++i) twist_[i] += step_[i];
-      return Next::motion;
+      for (int i = 0; i < 6 && moved > 0; ++i) twist_[i] += step_[i];
+      return try_motion();
     }
     renews_ = lag <= settled_share * settled_share * radius ? 1.0 : 0.5;
     share_ = 0;  // a pass at the twist
-    return Next::step;
-  }
-
-  // entry n of a vector; a group of threads has different n, and keeps the vector in registers
-  PD_HD static double pick(const double (&from)[6], int n) {
-#if defined(__CUDA_ARCH__)
-    double entry = from[0];
-    for (int i = 1; i < 6; ++i) entry = n == i ? from[i] : entry;
-    return entry;
-#else
-    return from[n];
-#endif
+    try_step();
   }
 
   PD_HD static double length_of(const double (&twist)[6]) {
@@ -250,9 +174,10 @@ class CoarseBody {
     set_trial(at, cross_matrix(turn_of(at)));
   }
 
-  // The finite trial.
+  // The finite trial, unless no motion is left.
   PD_HD void try_motion() {
     finite_ = true;
+    done_ = length_of(twist_) == 0;
     set_trial(twist_, small_turn(turn_of(twist_)));
   }
 
@@ -288,51 +213,91 @@ class CoarseBody {
     moment_ = length_ * axis_of(covariance);
   }
 
-  // Of Phi to first order at a twist: the second derivative, and minus the first.
-  template <class Terms>
-  PD_HD Terms terms_at(const double (&at)[6], const double (&sum)[ContactSums::count]) const {
-    const Vec3<double> shift = {at[0], at[1], at[2]}, turn = {at[3], at[4], at[5]};
+  // Of Phi to first order at the twist and a share of the step: the second derivative, and minus the first.
+  PD_HD void find_terms(const double (&sum)[ContactSums::count],
+                        double (&terms)[terms_count]) const {
+    double now[6];
+    for (int i = 0; i < 6; ++i) now[i] = multiply_add(share_, step_[i], twist_[i]);
+    const Vec3<double> shift = {now[0], now[1], now[2]}, turn = {now[3], now[4], now[5]};
     const Vec3<double> f = subtract_product(force_, body_.weight, shift),
                        m = moment_ - second_ * turn;
     const double force[6] = {f.x, f.y, f.z, m.x, m.y, m.z};
     const double turns[6] = {second_.row[0].x, second_.row[1].x, second_.row[1].y,
                              second_.row[2].x, second_.row[2].y, second_.row[2].z};
-    Terms terms;
-    terms.set([&](int n, int r, int c, double) {
-      const double own = r == 6  ? pick(force, c)
-                         : r < 3 ? (r == c ? body_.weight : 0.0)
-                         : c < 3 ? 0.0
-                                 : pick(turns, Terms::at(r - 3, c - 3));
-      const double scale = (r < 3 || r == 6 ? 1.0 : length_) * (c < 3 ? 1.0 : length_);
-      return multiply_add(scale, sum[ContactSums::matrix + n], own);
-    });
+    PD_UNROLL
+    for (int r = 0; r <= 6; ++r) {
+      PD_UNROLL
+      for (int c = 0; c <= r && c < 6; ++c) {
+        const double own = r == 6  ? force[c]
+                           : r < 3 ? (r == c ? body_.weight : 0.0)
+                           : c < 3 ? 0.0
+                                   : turns[at(r - 3, c - 3)];
+        const double scale = (r < 3 || r == 6 ? 1.0 : length_) * (c < 3 ? 1.0 : length_);
+        terms[at(r, c)] = multiply_add(scale, sum[ContactSums::matrix + at(r, c)], own);
+      }
+    }
     if (body_.hold != Hold::none) keep_to_pins(terms);
-    return terms;
   }
 
   // Pins leave no shift; along a line they leave the turn about it.
-  template <class Terms>
-  PD_HD void keep_to_pins(Terms& terms) const {
+  PD_HD void keep_to_pins(double (&terms)[terms_count]) const {
+    const double axis[3] = {body_.axis.x, body_.axis.y, body_.axis.z};
     const bool line = body_.hold == Hold::line;
-    const double axis[6] = {0, 0, 0, body_.axis.x, body_.axis.y, body_.axis.z};
-    const double along = terms.sum([&](int r, int c, double entry) {
-      return r < 6 ? (r == c ? 1.0 : 2.0) * entry * (pick(axis, r) * pick(axis, c)) : 0.0;
-    });
-    const double force =
-        terms.sum([&](int r, int c, double entry) { return r == 6 ? entry * pick(axis, c) : 0.0; });
-    terms.set([&](int, int r, int c, double entry) {
-      if (c < 3 || !line) return c < 3 ? 0.0 : entry;
-      return r == 6 ? force * pick(axis, c) : r == c ? along : 0.0;
-    });
+    double along = 0, force = 0;
+    PD_UNROLL
+    for (int r = 0; r < 3; ++r) {
+      force = multiply_add(terms[at(6, 3 + r)], axis[r], force);
+      PD_UNROLL
+      for (int c = 0; c < 3; ++c)
+        along = multiply_add(terms[c < r ? at(3 + r, 3 + c) : at(3 + c, 3 + r)],
+                             axis[r] * axis[c], along);
+    }
+    PD_UNROLL
+    for (int r = 0; r <= 6; ++r) {
+      PD_UNROLL
+      for (int c = 0; c <= r && c < 6; ++c) {
+        double& term = terms[at(r, c)];
+        if (c < 3) {
+          term = 0;
+        } else if (line) {
+          term = r == 6 ? force * axis[c - 3] : r == c ? along : 0.0;
+        }
+      }
+    }
+  }
+
+  // step = x with A x = b for an A that is not negative, 0 along rows without pivot: A = L D L^T. Terms are lost.
+  PD_HD void solve(double (&a)[terms_count]) {
+    double most = 0, inverse[6];
+    PD_UNROLL
+    for (int i = 0; i < 6; ++i) most = a[at(i, i)] > most ? a[at(i, i)] : most;
+    PD_UNROLL
+    for (int j = 0; j < 6; ++j) {
+      const double pivot = a[at(j, j)];
+      inverse[j] = pivot > no_pivot * most ? 1.0 / pivot : 0.0;
+      PD_UNROLL
+      for (int c = j + 1; c < 6; ++c) {
+        const double factor = inverse[j] * a[at(c, j)];
+        PD_UNROLL
+        for (int r = c; r <= 6; ++r) a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
+      }
+    }
+    PD_UNROLL
+    for (int j = 5; j >= 0; --j) {
+      step_[j] = inverse[j] * a[at(6, j)];
+      PD_UNROLL
+      for (int c = 0; c < j; ++c)
+        a[at(6, c)] = subtract_product(a[at(6, c)], a[at(j, c)], step_[j]);
+    }
   }
 
   RigidBody body_;
   RigidMotion<double> accepted_, trial_;
   Mat3<double> second_;
   Vec3<double> force_, moment_;
-  double still_, lag_;    // of the size, and of the radii: that end the passes
+  double still_, lag_;    // of the size, and of the radii: that may be left
   double size_, length_;  // length_: 1 / size_
-  double twist_[6] = {}, step_[6], share_ = 1, low_ = 0, high_ = 1;
+  double twist_[6] = {}, step_[6] = {}, share_ = 0, low_ = 0, high_ = 1;
   double contact_energy_ = 0;
   int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
   double renews_ = 0;  // share by which the pass moves radii toward friction l
