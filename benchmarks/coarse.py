@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from tumbles import SEED, SOLVED, STEPS, Row, Still, random_tumble, still_problem
 
 from torchpd.reference import step_problem
-from torchpd.reference.coarse_step import coarse_chebyshev, corrected
+from torchpd.reference.coarse_step import coarse_chebyshev
 from torchpd.reference.problem import StepProblem
+from torchpd.reference.rigid import corrected
 from torchpd.reference.solvers import guarded_chebyshev
 
 ITERATIONS = 16

@@ -60,6 +60,21 @@ class Course:
             out.append((x, v))
         return out
 
+    def library(self, iterations: int, dtype: torch.dtype = torch.float64) -> list[tuple[Array, Array]]:
+        """The same course by the library's own steps."""
+        sim = pd.Simulator(self.scene, H, iterations, pd.Chebyshev(), dtype, progress=False)
+
+        def solve(problem: StepProblem) -> Array:
+            state = pd.State(*(torch.from_numpy(a)[None].to(dtype) for a in (problem.positions, problem.velocities)))
+            with torch.no_grad():
+                return H * sim(state, targets=self._targets(problem, dtype)).velocities[0].double().numpy()
+
+        return self.run(solve)
+
+    def _targets(self, problem: StepProblem, dtype: torch.dtype) -> dict[pd.Sphere, torch.Tensor]:
+        rows = np.concatenate([problem.sphere_centers, problem.sphere_motions / H], axis=1)
+        return dict(zip(self.scene.spheres, torch.from_numpy(rows).to(dtype), strict=True))
+
     def converged(self) -> list[tuple[Array, Array]]:
         """The same course with every step solved to a residual of 1e-9."""
         rough = any(plane.friction > 0.3 for plane in self.scene.grounds) or self.scene.spheres
@@ -68,10 +83,8 @@ class Course:
 
         def solve(problem: StepProblem) -> Array:
             state = pd.State(*(torch.from_numpy(a)[None].clone() for a in (problem.positions, problem.velocities)))
-            rows = np.concatenate([problem.sphere_centers, problem.sphere_motions / H], axis=1)
-            targets = dict(zip(self.scene.spheres, torch.from_numpy(rows), strict=True))
             with torch.no_grad():
-                u = H * sim(state, targets=targets).velocities[0].numpy()
+                u = H * sim(state, targets=self._targets(problem, torch.float64)).velocities[0].numpy()
             for _ in range(40):
                 if problem.relative_residual(u) <= SOLVED:
                     return u

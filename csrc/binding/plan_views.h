@@ -35,7 +35,7 @@ inline const int32* sizes_view(const Tensor& t, std::int64_t count) {
 
 // Lengths of the arrays, by the names in cpu_plan.def.
 struct PlanRows {
-  std::int64_t size, vertex, component, pin, block, patch_end, slot, shared_end, shared_slot;
+  std::int64_t size, vertex, pin, block, patch_end, slot, shared_end, shared_slot;
 };
 
 #define X(name, type, width, rows, meaning) +1
@@ -180,6 +180,7 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   plan.tets = size[plan_tets];
   plan.pins = size[plan_pins];
   plan.components = size[plan_components];
+  plan.solid_components = size[plan_solid_components];
   plan.blocks = size[plan_blocks];
   plan.patches = size[plan_patches];
   plan.slots = size[plan_slots];
@@ -194,7 +195,6 @@ Plan<T> plan_view(at::TensorList arrays, const Place& place) {
   PlanRows count{};
   count.size = plan_size_count;
   count.vertex = plan.vertices;
-  count.component = plan.components;
   count.pin = plan.pins;
   count.block = plan.blocks;
   count.patch_end = plan.patches + 1;
@@ -246,7 +246,7 @@ constexpr int part_slot_array = int(DevicePlanArray::part_slot);
 // Lengths of the arrays, by the names in gpu_plan.def.
 struct DevicePlanRows {
   std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
-      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, piece_end, part,
+      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, part, level_end, sum, piece,
       stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex,
       coupled_block;
 };
@@ -361,8 +361,10 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.part_patch_end = pieces ? plan.patches + 1 : 0;
   count.part_end = pieces ? plan.parts + 1 : 0;
   count.part_slot = pieces ? arrays[part_slot_array].size(0) : 0;
-  count.piece_end = pieces ? plan.pieces + 1 : 0;
   count.part = plan.parts;
+  count.level_end = pieces ? plan.sum_levels + 1 : 0;
+  count.sum = plan.sums;
+  count.piece = plan.pieces;
   const bool computed = plan.kernel == stream, fixed = computed && sizeof(T) == 4;
   count.stored_block = computed ? 0 : plan.blocks;
   count.rest_slot = computed && !fixed ? plan.slots : 0;

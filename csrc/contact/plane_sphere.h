@@ -11,12 +11,7 @@
 #include "math/mat.h"
 #include "math/scalar.h"
 
-#include <limits>
-
 namespace pd::inline PD_TARGET {
-
-// A vertex lies on a contact when its gap is at most this share of the displacement.
-constexpr double contact_tolerance = 0.01;
 
 template <class R>
 struct Plane {
@@ -79,23 +74,6 @@ PD_HD Vec3<R> push_out(const Vec3<R>& u, const Vec3<R>& normal, const R& depth, 
   const R length = square_root(dot(slip, slip));
   const R friction_scale = lesser(friction_bound / select(length > none, length, R(1)), R(1));
   return select(has_friction, subtract_product(pushed, friction_scale, slip), pushed);
-}
-
-// Gap to a sphere after a `displacement`. It is at most 0 where the vertex lies on the sphere and its lift-off is
-// below friction * slip. A force within the friction cone could then prevent that displacement.
-template <class R>
-PD_HD R remaining_gap(const Sphere<R>& sphere, const R& friction, const Vec3<R>& x,
-                      const Vec3<R>& displacement) {
-  using T = scalar_of<R>;
-  const Vec3<R> normal = outward(sphere, x);
-  const R across = dot(normal, displacement), size = square_root(dot(displacement, displacement));
-  const R rounding =
-      R(4 * std::numeric_limits<T>::epsilon()) * (square_root(dot(x, x)) + sphere.radius);
-  const auto lies = !(gap(sphere, x) > multiply_add(R(T(contact_tolerance)), size, rounding));
-  const Vec3<R> along = subtract_product(displacement, across, normal);
-  const R lift = subtract_product(across, friction, square_root(dot(along, along)));
-  const R after = gap(sphere, x + displacement);
-  return select(lies, lesser(after, lift), after);
 }
 
 // Squared part of a unit normal that earlier normals do not span; below it the normal counts as dependent.
@@ -222,37 +200,14 @@ struct Contacts {
     });
   }
 
+  PD_HD bool exist() const { return plane_count + sphere_count > 0; }
+
   // the largest coefficient of any contact
   PD_HD R friction() const {
     R most(0);
     for (int i = 0; i < plane_count; ++i) most = -lesser(-most, -planes[i].friction);
     for (int i = 0; i < sphere_count; ++i) most = -lesser(-most, -spheres[i].friction);
     return most;
-  }
-
-  PD_HD bool has_multiple() const { return plane_count + sphere_count > 1; }
-
-  // The smallest gap to all spheres, and to the planes from `first` on.
-  PD_HD R least_gap(const Vec3<R>& x, int first) const {
-    R least(HUGE_VAL);
-    for (int i = first; i < plane_count; ++i) least = lesser(least, gap(planes[i], x));
-    for (int i = 0; i < sphere_count; ++i) least = lesser(least, gap(spheres[i], x));
-    return least;
-  }
-
-  // The same after a `displacement`. `settled`: friction may hold the vertex (remaining_gap). A single sphere can
-  // hold by friction only a vertex in contact.
-  PD_HD R least_remaining_gap(const Vec3<R>& x, const Vec3<R>& displacement, int first,
-                              bool settled) const {
-    if (!settled) return least_gap(x + displacement, first);
-    R least(HUGE_VAL);
-    for (int i = first; i < plane_count; ++i)
-      least = lesser(least, gap(planes[i], x + displacement));
-    for (int i = 0; i < sphere_count; ++i) {
-      const R friction = has_multiple() ? spheres[i].friction : R(0);
-      least = lesser(least, remaining_gap(spheres[i], friction, x, displacement));
-    }
-    return least;
   }
 
  private:

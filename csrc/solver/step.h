@@ -52,7 +52,7 @@ template <class Runner>
 PD_HD void step(Runner& run, const Settings& settings) {
   run.predict();  // targets s: where inertia, forces and springs would take each vertex
   run.start();    // first iterate, on the pins and out of the contacts
-  run.align();    // components with free rigid motions: exact minimum along these
+  run.align();    // coarse correction: rigid motions of components that pins leave free
   for (int k = 0; k < settings.iterations; ++k) {
     // local step on every element, then one Jacobi iteration on every vertex, accelerated and projected
     run.iterate(k);

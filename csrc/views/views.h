@@ -22,6 +22,7 @@ enum PlanSize : int {
   plan_shared,
   plan_most_slots,
   plan_members,
+  plan_solid_components,
   plan_size_count
 };
 
@@ -105,8 +106,8 @@ struct Plan {
 #include "views/cpu_plan.def"
 #include "views/cpu_stencils.def"
 #undef X
-  int vertices = 0, tets = 0, pins = 0, components = 0, blocks = 0, patches = 0, slots = 0,
-      shared = 0;
+  int vertices = 0, tets = 0, pins = 0, components = 0, solid_components = 0, blocks = 0,
+      patches = 0, slots = 0, shared = 0;
   int most_slots = 0;  // of any patch
   int members = 1;     // tetrahedra of a group that averages its trace: 1, 2 or 4
   int stencil_blocks = 0,

@@ -1,8 +1,9 @@
-"""Where a step starts: on its straight course, or where a body is that contacts would squeeze by more than it gains."""
+"""Where a step starts: at the guess, or in the present shape where that has less energy, both moved as rigid bodies."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 import torchpd as pd
-from torchpd.reference import StepProblem
+from torchpd.reference import StepProblem, step_problem
+from torchpd.reference.coarse import correct
+from torchpd.reference.envelopes import pushes_of
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
@@ -79,6 +82,48 @@ def test_a_plane_that_nothing_comes_near_changes_nothing(iterations: int, device
     assert np.abs(near - far).max() <= 1e-12 * np.abs(far).max()
 
 
+def early(problem: StepProblem, displacement: Array, forces: Array | None = None) -> Array:
+    """A displacement [V, 3] m as corrected before the iterations, from the forces [C, V, 3] N of contacts."""
+    given = pushes_of(problem, displacement, problem.gradient(displacement)) if forces is None else forces
+    return correct(problem, displacement, given, early=True).displacement
+
+
+def stretching(youngs: float, *planes: pd.Part, **options: Any) -> Case:
+    """A block that grows longer: its guess has that strain, its present shape lacks the way."""
+    case = contact_block(*planes, youngs=youngs, **options)
+    return replace(case, velocities=case.velocities + case.positions * [1.0, 0.0, 0.0])
+
+
+STRETCHING = {"flies": (), "lies": (pd.Ground(0.0),), "lands": (pd.Ground(-0.002),)}
+
+
+@pytest.mark.parametrize("name", STRETCHING)
+@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize("youngs", [1e4, 1e6])
+def test_it_starts_in_the_shape_of_less_energy(
+    youngs: float, weighted: bool, name: str, dtype: torch.dtype, device: torch.device
+) -> None:
+    """A soft block at the guess, a stiff one in its present shape, both after a coarse correction."""
+    planes = STRETCHING[name]
+    case = stretching(youngs, *planes)
+    problem = rounded_problem(case, dtype).with_diagonal(weighted=weighted)
+    still = np.zeros_like(problem.positions)
+    guess = early(problem, problem.unsolved())
+    # nothing strains the present shape, so that no contact has a force there
+    present = early(problem, still, np.zeros((len(planes), *still.shape)))
+    energies = [problem.energy(u) for u in (guess, present)]
+    assert (energies[0] < 0.8 * energies[1]) == (youngs == 1e4)
+    assert (energies[1] < 0.8 * energies[0]) == (youngs == 1e6)
+    first = problem.first_iterate()
+    size = np.abs(first).max()
+    # float32 rounds the rest shape: strains of its ulps
+    assert np.abs(first - (guess if youngs == 1e4 else present)).max() <= 1e-5 * size
+    solver = pd.Jacobi(diagonal="weighted" if weighted else "plain")
+    sim = simulator(case, dtype, device, solver=solver, iterations=0)
+    found = displacement(sim, sim(state_of(case, sim)))
+    assert np.abs(found - problem.align(first)).max() <= 1e-5 * size
+
+
 def sinking(youngs: float) -> Case:
     """A single tetrahedron, one corner of which comes below the ground."""
     corners = np.array([[0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [0.0, 0.25, 0.2], [-0.2, 0.3, -0.1]])
@@ -87,68 +132,71 @@ def sinking(youngs: float) -> Case:
     return Case(scene, corners, np.tile([0.0, -0.6, 0.0], (4, 1)), H)
 
 
-def critical_stiffness(weighted: bool) -> float:
-    """Where the course is as good as no way, by hand: corner 0 is pushed out by d, all others sink by d.
-
-    sum a |u - s|^2 is left, a_0 (d + f)^2 + sum_j a_j f^2 with f the fall by gravity; k_0 (1 - k_0 / sum k) d^2 / 2 is
-    the squeeze; sum a (d + f)^2 if they stay.
-    """
-    problem = sinking(1.0).problem()
-    d, f = H * 0.6, 9.81 * H**2
-    a = problem.weight
-    k = (problem.weighted_diagonal if weighted else problem.plain_diagonal) - a  # of 1 Pa
-    gain = a.sum() * (d + f) ** 2 - a[0] * (d + f) ** 2 - a[1:].sum() * f**2
-    return float(gain / (0.5 * k[0] * (1.0 - k[0] / k.sum()) * d**2))
-
-
-@pytest.mark.parametrize("weighted", [True, False])
-def test_it_starts_where_it_is_from_that_stiffness_on(weighted: bool, dtype: torch.dtype, device: torch.device) -> None:
-    """On the course three corners go down; where it is, a rigid motion turns it about the lowest one."""
-    critical = critical_stiffness(weighted)
-    solver = pd.Jacobi(diagonal="weighted" if weighted else "plain")
-    for factor in (0.99, 1.01):
-        case = sinking(factor * critical)
-        problem = rounded_problem(case, dtype)
-        course = problem.align(problem.unsolved(), first=True)
-        still = problem.align(np.zeros_like(course), first=True)
-        assert np.abs(course - still).max() > 1e-3
-        sim = simulator(case, dtype, device, solver=solver, iterations=0)
-        found = displacement(sim, sim(state_of(case, sim)))
-        expected = problem.align(course if factor < 1.0 else still)
-        assert np.abs(found - expected).max() <= 1e-5 * np.abs(expected).max()
-        assert np.array_equal(problem.first_iterate(weighted=weighted), course if factor < 1.0 else still)
+@pytest.mark.parametrize("youngs", [1e2, 1e4, 1e5, 1e6, 1e7])
+def test_what_the_ground_pushes_weighs_in_the_choice(youngs: float, dtype: torch.dtype, device: torch.device) -> None:
+    """A push of the present shape leaves a corner behind: inertia that anchors of elastic forces do not answer."""
+    case = sinking(youngs)
+    problem = rounded_problem(case, dtype)
+    still = np.zeros_like(problem.positions)
+    guess, present = early(problem, problem.unsolved()), early(problem, still, still[None])
+    assert (problem.energy(guess) < 0.97 * problem.energy(present)) == (youngs <= 1e5)
+    first = problem.first_iterate()
+    assert np.abs(first - (guess if youngs <= 1e5 else present)).max() <= 1e-5 * np.abs(first).max()
+    sim = simulator(case, dtype, device, iterations=0)
+    found = displacement(sim, sim(state_of(case, sim)))
+    assert np.abs(found - problem.align(first)).max() <= 1e-5 * np.abs(first).max()
 
 
 def test_environments_choose_for_themselves(device: torch.device) -> None:
-    """The same state in materials on both sides of that stiffness, beside each other and alone."""
-    case = sinking(critical_stiffness(True))
+    """The same state in soft and stiff materials, beside each other and alone."""
+    case = stretching(1e4, pd.Ground(0.0))
     sim = simulator(case, torch.float64, device, iterations=0)
-    factors = torch.tensor([0.9, 1.1, 0.99, 1.01, 2.0, 0.5, 1.1, 0.9, 1.01], dtype=torch.float64, device=device)
+    factors = torch.tensor([1.0, 128.0, 0.125, 64.0, 0.5, 256.0, 1.0, 128.0, 0.25], dtype=torch.float64, device=device)
     sim.set_material(stiffness=sim.stiffness * factors[:, None])
     after = sim(state_of(case, sim, len(factors)))
+    longer = []
     for n, factor in enumerate(factors.tolist()):
-        alone = simulator(sinking(factor * critical_stiffness(True)), torch.float64, device, iterations=0)
+        alone = simulator(stretching(factor * 1e4, pd.Ground(0.0)), torch.float64, device, iterations=0)
         assert torch.equal(after.positions[n], alone(state_of(case, alone)).positions[0])
-    assert len({tuple(x) for x in after.positions[:, 1].tolist()}) == 2
+        longer.append(float(after.positions[n, :, 0].max() - after.positions[n, :, 0].min()) > 0.302)
+    assert longer == [factor <= 1.0 for factor in factors.tolist()]
 
 
-def on(*planes: pd.Part, **options: object) -> tuple[StepProblem, Case]:
-    case = contact_block(*planes, velocity=(0.0, -1.0, 0.0), youngs=1e7)
-    case = replace(case, velocities=case.velocities + 1e-3 * case.positions)
-    return case.problem(), case
+def test_a_body_on_the_ground_is_not_moved_into_it() -> None:
+    """Of two blocks one falls exactly. The other gives in and tilts by weight / sum D: D differs by corner."""
+    low, high = contact_block(), contact_block(height=3.0)
+    bodies = [pd.Solid(pd.TetMesh(case.positions, case.scene.values().tets), 1e5) for case in (low, high)]
+    values = pd.Scene(*bodies, pd.Gravity(), pd.Ground()).values()
+    problem = step_problem(values, values.rest_positions, 0.0 * values.rest_positions, H)
+    first = problem.first_iterate()
+    foot = values.rest_positions[:64, 1] == 0.0
+    np.testing.assert_allclose(first[:64][foot, 1], 0.0, atol=1e-17)
+    np.testing.assert_allclose(problem.weight[:64] @ first[:64, [0, 2]], 0.0, atol=1e-17 * problem.weight[:64].sum())
+    give = values.masses[:64].sum() * -values.gravity[1] / problem.diagonal[:64][foot].sum()
+    assert np.abs(first[:64]).max() <= 2.0 * give
+    np.testing.assert_allclose(first[64:], np.tile(H**2 * values.gravity, (64, 1)), atol=1e-15)
 
 
-def test_balls_and_pins_leave_it_on_its_course() -> None:
-    """What rigid motions do not free from the squeeze keeps its momentum."""
-    lands, _ = on(pd.Ground(-0.001))
-    assert (lands.first_iterate() - lands.align(lands.unsolved(), first=True)).any()
-    for part in (pd.Sphere((0.15, -0.2, 0.15), 0.199), None):
-        problem, case = on(pd.Ground(-0.001)) if part is None else on(part)
-        if part is None:
-            body = case.scene.solids[0]
-            pinned = pd.Scene(*case.scene.parts, pd.Pin(body, [0]))
-            problem = replace(case, scene=pinned).problem()
-        assert np.array_equal(problem.first_iterate(), problem.align(problem.unsolved(), first=True))
+def pinned(case: Case) -> Case:
+    return replace(case, scene=pd.Scene(*case.scene.parts, pd.Pin(case.scene.solids[0], [0])))
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        stretching(1e7, pd.Sphere((0.15, -0.2, 0.15), 0.199), velocity=(0.0, -1.0, 0.0)),
+        pinned(stretching(1e7, pd.Ground(-0.001), velocity=(0.0, -1.0, 0.0))),
+    ],
+    ids=["ball", "pin"],
+)
+def test_balls_and_pins_leave_it_in_its_shape(case: Case, device: torch.device) -> None:
+    """A stiff block that lands on a ball, or turns about a corner on to the ground, is not strained by the guess."""
+    problem = case.problem()
+    first = problem.first_iterate()
+    assert problem.energy(first) < 0.5 * problem.energy(problem.align(problem.unsolved()))
+    sim = simulator(case, torch.float64, device, iterations=0)
+    found = displacement(sim, sim(state_of(case, sim)))
+    assert np.abs(found - problem.align(first)).max() <= 1e-9 * np.abs(first).max()
 
 
 def best_landing(problem: StepProblem) -> Array:
@@ -185,13 +233,13 @@ def dropped(number: int) -> Case:
     x = (vertices - vertices.mean(axis=0)) @ turn.T
     x[:, 1] += rng.choice([0.0, 0.001, 0.02]) - x[:, 1].min()
     v = [0.0, -rng.uniform(0.5, 2.0), 0.0] + np.cross(3.0 * rng.standard_normal(3), x - x.mean(axis=0))
-    return Case(pd.Scene(pd.Solid(pd.TetMesh(x, tets), 1e9), pd.Gravity(), pd.Ground()), x, v, H)
+    return Case(pd.Scene(pd.Solid(pd.TetMesh(x, tets), 1e11), pd.Gravity(), pd.Ground()), x, v, H)
 
 
 def test_it_lands_where_energy_is_least_along_rigid_motions(device: torch.device) -> None:
     """On a face, an edge or a corner, or from one on to another, as SciPy's SLSQP finds too.
 
-    Some leave a vertex above the ground by what counts as lying, a hundredth of the way that the ground stops.
+    So stiff that contacts yield by less than the assertions ask.
     """
     left = []
     for case in map(dropped, range(60)):
@@ -201,6 +249,5 @@ def test_it_lands_where_energy_is_least_along_rigid_motions(device: torch.device
             found = displacement(sim, sim(state_of(case, sim)))
             left.append(np.linalg.norm(found - best) / np.linalg.norm(best))
     assert len(left) >= 50
-    assert np.median(left) <= 1e-5
-    assert np.quantile(left, 0.75) <= 1e-3
-    assert max(left) <= 0.1
+    assert np.quantile(left, 0.75) <= 1e-5
+    assert max(left) <= 1e-3

@@ -55,11 +55,11 @@ def test_rough_balls_take_a_cube_along(name: str, youngs: float, dtype: torch.dt
     assert float((found[-10:].diff() / (SPEED * H)).sub(1.0).abs().max()) <= (0.2 if youngs == 1e5 else 0.02)
 
 
-@pytest.mark.parametrize(("friction", "held"), [(1.0, True), (0.02, False)])
+@pytest.mark.parametrize(("friction", "steps"), [(1.0, 12), (0.02, 3)], ids=["held", "slips"])
 def test_it_takes_friction_to_hold_a_weight(
-    friction: float, held: bool, dtype: torch.dtype, device: torch.device
+    friction: float, steps: int, dtype: torch.dtype, device: torch.device
 ) -> None:
-    """Of 9.8 N, by two forces of some 99 N times the coefficient."""
+    """Of 9.8 N, by two forces of some 99 N times the coefficient. Later the balls catch the next vertices."""
     sim, balls = gripped(1e6, friction, dtype, device, gravity=-9.8)
     sim.set_material(gravity=torch.zeros(3, dtype=dtype, device=device))
     state = sim.rest_state()
@@ -67,8 +67,8 @@ def test_it_takes_friction_to_hold_a_weight(
         state = sim(state, targets=fingers(sim, balls, step))
     sim.set_material(gravity=torch.tensor([0.0, -9.8, 0.0], dtype=dtype, device=device))
     still = fingers(sim, balls, CLOSING - 1)
-    for _ in range(12):
+    for _ in range(steps):
         state = sim(state, targets=still)
     fallen = -float(state.positions[0, :, 1].mean())
-    # a free fall of 12 steps goes 78 h^2 g
-    assert fallen <= 3e-4 if held else fallen >= 0.5 * 78 * 9.8 * H**2
+    # a free fall of 3 steps goes 6 h^2 g
+    assert fallen <= 3e-4 if friction == 1.0 else fallen >= 0.5 * 6 * 9.8 * H**2

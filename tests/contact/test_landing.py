@@ -83,10 +83,11 @@ def test_environments_that_land_differently_do_not_know_of_each_other(
     factors = torch.linspace(0.25, 2.0, 5).tolist()
     starts = [(s.positions.to(dtype), f * s.velocities.to(dtype)) for f in factors for s in states[:STEPS]][:17]
     positions, velocities = (torch.cat(parts) for parts in zip(*starts, strict=True))
-    together, info = sim(pd.State(positions, velocities), return_info=True)
+    # from their present shape; the first iterate of a step is so near that none has trials to shorten
+    together, info = sim(pd.State(positions, velocities), start=positions, return_info=True)
     assert int(info.restarts.min()) <= 2
     assert int(info.restarts.max()) >= 9
     assert (len(set(info.iterations.tolist())) > 1) == (tolerance > 0.0)
     for i, (x, v) in enumerate(starts):
-        alone = sim(pd.State(x, v))
+        alone = sim(pd.State(x, v), start=x)
         assert same_bits(alone, pd.State(together.positions[i : i + 1], together.velocities[i : i + 1]))

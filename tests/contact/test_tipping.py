@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from cases import Case, Still, box, leaning, oriented, rotation
+from cases import Case, box, leaning, oriented, rotation
 from numpy.typing import NDArray
 from runs import simulator, state_of
 
 import torchpd as pd
 from torchpd.reference import step_problem
-from torchpd.reference.solvers import guarded_chebyshev
 
 pytestmark = pytest.mark.usefixtures("poisoned")
 
 Array = NDArray[np.float64]
 ULP = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 H = 1 / 60
+# What contacts push a vertex after the rigid motion, and with it their lever arms: at most this share of the size.
+PUSHED = 2e-4
+# Passes end with friction radii within 1e-6 of friction times l, and the motion answers those before, at twice the
+# distance; of two vertices, sqrt(2) times that. Positions in float32 have no more than three digits of a push.
+RUBBED = {torch.float32: 1e-3, torch.float64: 3e-6}
 
 
 def after_step(case: Case, dtype: torch.dtype, device: torch.device, count: int, **options: Any) -> tuple[Array, Array]:
@@ -29,13 +32,17 @@ def after_step(case: Case, dtype: torch.dtype, device: torch.device, count: int,
     return after.positions[0].double().cpu().numpy(), after.velocities[0].double().cpu().numpy()
 
 
-def contact_force(case: Case, x: Array, v: Array, about: Array) -> tuple[Array, Array, float]:
-    """Impulse of the contacts in a step, their torque about a point, and what rounding may make of either, in ulps."""
+def contact_force(case: Case, x: Array, v: Array, about: Array, ulp: float) -> tuple[Array, Array, float, float]:
+    """Impulse of the contacts in a step, their torque about a point, and what may be left of either.
+
+    Of the impulse that is rounding; of the torque, what pushes after the rigid motion leave, or rounding.
+    """
     values = case.scene.values()
     masses = values.masses[:, None]
     push = masses * (v - case.velocities - H * values.gravity)
-    size = float((masses * (np.abs(v) + np.abs(x) / H)).sum())
-    return push.sum(axis=0), np.cross(x - about, push).sum(axis=0), size
+    rounding = 32 * ulp * float((masses * (np.abs(v) + np.abs(x) / H)).sum())
+    force, torque = push.sum(axis=0), np.cross(x - about, push).sum(axis=0)
+    return force, torque, rounding, max(PUSHED * float(np.linalg.norm(force) * np.ptp(x, axis=0).max()), rounding)
 
 
 @pytest.mark.parametrize("count", [0, 3, 64])
@@ -45,8 +52,8 @@ def test_a_bar_falls_about_the_corner_that_it_stands_on(count: int, dtype: torch
     corner = int(case.positions[:, 1].argmin())
     x, v = after_step(case, dtype, device, count)
     assert np.abs(x[corner] - case.positions[corner]).max() <= 4 * ULP[dtype]
-    push, torque, size = contact_force(case, x, v, x[corner])
-    assert np.abs(torque).max() <= 32 * ULP[dtype] * size
+    push, torque, _, left = contact_force(case, x, v, x[corner], ULP[dtype])
+    assert np.abs(torque).max() <= left
     assert push[1] > 0.0
     assert np.hypot(push[0], push[2]) <= 0.8 * push[1]
     weight = H * 9.8 * case.scene.values().masses.sum()
@@ -59,11 +66,11 @@ def test_on_smooth_ground_its_middle_falls_straight(count: int, dtype: torch.dty
     case = leaning(0.0)
     corner = int(case.positions[:, 1].argmin())
     x, v = after_step(case, dtype, device, count)
-    push, torque, size = contact_force(case, x, v, x[corner])
+    push, torque, rounding, left = contact_force(case, x, v, x[corner], ULP[dtype])
     assert x[:, 1].min() >= -4 * ULP[dtype]
     assert x[corner, 1] <= 4 * ULP[dtype]
-    assert np.abs(push[[0, 2]]).max() <= 32 * ULP[dtype] * size
-    assert np.abs(torque).max() <= 32 * ULP[dtype] * size
+    assert np.abs(push[[0, 2]]).max() <= rounding
+    assert np.abs(torque).max() <= left
     assert 0.0 < push[1] < 0.9 * H * 9.8 * case.scene.values().masses.sum()
 
 
@@ -72,13 +79,13 @@ def test_what_slides_and_tips_does_so_by_the_law_of_coulomb(dtype: torch.dtype, 
     case = leaning(0.1, velocity=(1.0, 0.0, 0.5))
     foot = int(case.positions[:, 1].argmin())
     x, v = after_step(case, dtype, device, 3)
-    push, torque, size = contact_force(case, x, v, x[foot])
-    assert np.abs(torque).max() <= 64 * ULP[dtype] * size
+    push, torque, _, left = contact_force(case, x, v, x[foot], ULP[dtype])
+    assert np.abs(torque).max() <= left
     slip = x[foot] - case.positions[foot]
     against = -slip[[0, 2]] / np.linalg.norm(slip[[0, 2]])
     assert push[1] > 0.0
     rub = float(np.hypot(push[0], push[2]))
-    assert rub == pytest.approx(0.1 * push[1], rel=1e-3 if dtype == torch.float32 else 1e-9)
+    assert rub == pytest.approx(0.1 * push[1], rel=RUBBED[dtype])
     assert push[[0, 2]] @ against > 0.999 * rub
 
 
@@ -86,93 +93,27 @@ def sliding_on_an_edge() -> Case:
     return leaning(0.3, turn=(0.0, 0.0, 20.0), velocity=(1.0, 0.0, 0.15), gravity=(0.0, -9.8, 0.1))
 
 
-def check_that_it_rubs_where_it_is_pushed(case: Case, x: Array, v: Array, ulp: float, rounding: float) -> None:
+def check_that_it_rubs_where_it_is_pushed(case: Case, x: Array, v: Array, dtype: torch.dtype) -> None:
     """Aside from the middle of its edge. All along that friction has one direction: the torque is of a force alone."""
     edge = np.flatnonzero(case.positions[:, 1] < 1e-12)
     assert len(edge) == 2
-    push, torque, size = contact_force(case, x, v, x[edge].mean(axis=0))
+    push, torque, _, left = contact_force(case, x, v, x[edge].mean(axis=0), ULP[dtype])
     assert abs(torque[0]) > 1e-3 * push[1]  # its centre: a torque along x by how far it is aside
-    assert abs(push @ torque) <= 256 * ulp * size * np.linalg.norm(push)
-    assert np.hypot(push[0], push[2]) == pytest.approx(0.3 * push[1], rel=rounding)
+    assert abs(push @ torque) <= left * np.linalg.norm(push)
+    assert np.hypot(push[0], push[2]) == pytest.approx(0.3 * push[1], rel=RUBBED[dtype])
 
 
 def test_what_slides_on_an_edge_rubs_where_that_is_pushed(dtype: torch.dtype, device: torch.device) -> None:
     case = sliding_on_an_edge()
     x, v = after_step(case, dtype, device, 3)
-    check_that_it_rubs_where_it_is_pushed(case, x, v, ULP[dtype], 1e-3 if dtype == torch.float32 else 1e-8)
+    check_that_it_rubs_where_it_is_pushed(case, x, v, dtype)
 
 
 def test_in_the_oracle_it_rubs_there_as_well() -> None:
     case = sliding_on_an_edge()
     problem = step_problem(case.scene.values(), case.positions, case.velocities, H)
-    u = problem.align(problem.unsolved(), first=True)
-    check_that_it_rubs_where_it_is_pushed(case, case.positions + u, u / H, ULP[torch.float64], 1e-12)
-
-
-# of a cube of 0.1 m: turned by an angle [rad], friction, Young's modulus, cells an edge, steps
-TUMBLES = [
-    pytest.param(0.3, 0.1, 1e6, 2, 1, id="slides and turns"),
-    pytest.param(0.3, 0.3, 1e5, 2, 6, id="turns while it slides back"),
-    pytest.param(0.5, 0.3, 1e7, 2, 3, id="sticks at one end of its edge"),
-    pytest.param(0.7, 0.1, 1e5, 3, 4, id="an edge of four vertices"),
-    pytest.param(np.pi / 4, 0.1, 1e6, 2, 3, id="stands on its edge"),
-    pytest.param(0.7, 0.0, 1e5, 2, 3, id="smooth ground"),
-]
-
-
-def check_that_converged_steps_stay(case: Case, steps: int, device: torch.device) -> None:
-    """After a rigid motion that moves what the iterations have solved there is a residual."""
-    sim = simulator(case, torch.float64, device, iterations=600, solver=pd.Multilevel())
-    state = state_of(case, sim)
-    for _ in range(steps):
-        problem = step_problem(
-            case.scene.values(), state.positions[0].cpu().numpy(), state.velocities[0].cpu().numpy(), H
-        )
-        state = sim(state)
-        u = H * state.velocities[0].cpu().numpy()
-        scale = float(np.linalg.norm(problem.residual(problem.unsolved())))
-        assert np.linalg.norm(problem.residual(u)) <= 1e-8 * scale
-        assert np.abs(problem.align(u) - u).max() <= 1e-12
-
-
-@pytest.mark.parametrize(("angle", "friction", "youngs", "cells", "steps"), TUMBLES)
-def test_nothing_moves_once_the_iterations_have_converged(
-    angle: float, friction: float, youngs: float, cells: int, steps: int, device: torch.device
-) -> None:
-    """A cube lands on an edge: of its steps rigid motions left up to 14 % of the residual, at any iteration count."""
-    case = leaning(
-        friction, turn=(0.0, 0.0, float(np.degrees(angle))), size=(0.1, 0.1, 0.1), cells=(cells,) * 3,
-        velocity=(0.0, -1.0, 0.0), youngs=youngs,
-    )  # fmt: skip
-    check_that_converged_steps_stay(case, steps, device)
-
-
-def leaning_tower() -> Case:
-    """Its middle is above the base, near that edge which few of its vertices are at; it hits the ground hard."""
-    vertices, tets = box((0.1, 0.4, 0.1), (4, 4, 1))
-    vertices[:, 0] = 0.1 * (vertices[:, 0] / 0.1) ** 0.25
-    masses = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e7)).values().masses
-    middle = masses @ vertices / masses.sum()
-    vertices[:, 0] -= (middle[0] - 0.01) * vertices[:, 1] / middle[1]
-    scene = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e7), pd.Gravity(), pd.Ground(0.0))
-    return Case(scene, vertices, 0.0 * vertices - [0.0, 10.0, 0.0], H)
-
-
-def uneven_block() -> Case:
-    """A box whose vertices are shaken, which slides and turns on rough ground once it has landed."""
-    rng = np.random.default_rng(18)
-    size = np.array([0.2, 0.1, 0.1])
-    vertices, tets = box(tuple(size), (2, 2, 2))
-    vertices = (vertices + rng.uniform(-0.125, 0.125, vertices.shape) * size) @ rotation(79.3, 0.4, -44.9).T
-    vertices[:, 1] -= vertices[:, 1].min()
-    scene = pd.Scene(pd.Solid(pd.TetMesh(vertices, tets), 1e6), pd.Gravity(), pd.Ground(-0.005, friction=0.3))
-    return Case(scene, vertices, 0.0 * vertices - [0.0, 1.0, 0.0], H)
-
-
-@pytest.mark.parametrize(("case", "steps"), [(leaning_tower(), 1), (uneven_block(), 2)], ids=["smooth", "rough"])
-def test_a_balance_uphill_is_none_to_go_to(case: Case, steps: int, device: torch.device) -> None:
-    """About a line of two vertices torques balance a second time, with more energy: there rigid motions took them."""
-    check_that_converged_steps_stay(case, steps, device)
+    u = problem.align(problem.first_iterate())
+    check_that_it_rubs_where_it_is_pushed(case, case.positions + u, u / H, torch.float64)
 
 
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 33.0, 0.0)], ids=["along axes", "askew"])
@@ -190,8 +131,8 @@ def test_a_tall_box_tips_over_the_edge_that_it_is_pushed_over(
     assert np.abs(x[edge] - case.positions[edge]).max() <= 8 * ULP[dtype]
     assert x[on_face & ~edge, 1].min() > 1e-6
     along = rotation(*turn)[:, 2]
-    _, torque, size = contact_force(case, x, v, x[edge].mean(axis=0))
-    assert abs(torque @ along) <= 32 * ULP[dtype] * size
+    _, torque, _, left = contact_force(case, x, v, x[edge].mean(axis=0), ULP[dtype])
+    assert abs(torque @ along) <= left
 
 
 def test_what_rests_stays(dtype: torch.dtype, device: torch.device) -> None:
@@ -297,8 +238,8 @@ def test_a_column_of_three_sides_tips_over_an_edge(lean: float, dtype: torch.dty
     x, v = after_step(case, dtype, device, 3)
     assert np.abs(x[[1, 2]] - vertices[[1, 2]]).max() <= 8 * ULP[dtype]
     assert x[0, 1] > 1e-5
-    _, torque, size = contact_force(case, x, v, x[[1, 2]].mean(axis=0))
-    assert abs(torque[2]) <= 32 * ULP[dtype] * size
+    _, torque, _, left = contact_force(case, x, v, x[[1, 2]].mean(axis=0), ULP[dtype])
+    assert abs(torque[2]) <= left
 
 
 @pytest.mark.parametrize("place", [0.0, 5.0])
@@ -354,41 +295,6 @@ def test_what_is_dropped_comes_to_rest(count: int, dtype: torch.dtype, device: t
     # iterations push it out by the way of gravity in a step, to the rounding of that
     assert float(foot.min()) >= -ULP[dtype] * 9.8 * H**2
     assert int((foot < 1e-5).sum()) == 16
-
-
-def rolling() -> Case:
-    vertices, tets = box((0.2, 0.2, 0.2), (3, 3, 3))
-    vertices = vertices - vertices.mean(axis=0)
-    # every layer of the cube as a sphere
-    lengths = np.linalg.norm(vertices, axis=1, keepdims=True)
-    vertices *= np.abs(vertices).max(axis=1, keepdims=True) / np.maximum(lengths, 1e-9)
-    vertices = vertices @ rotation(5.0, 17.0, 8.0).T
-    vertices[:, 1] -= vertices[:, 1].min()
-    scene = pd.Scene(
-        pd.Solid(pd.TetMesh(vertices, tets), 1e5), pd.Gravity((3.0, -9.8, 0.0)), pd.Ground(0.0, friction=0.5)
-    )
-    return Case(scene, vertices, 0.0 * vertices, H)
-
-
-@pytest.mark.parametrize(
-    "case",
-    [
-        leaning(0.8, youngs=1e5), leaning(0.0, youngs=1e5), leaning(0.1, velocity=(1.0, 0.0, 0.5), youngs=1e5),
-        leaning(1.0, turn=(0.0, 0.0, 0.0), size=(0.1, 0.4, 0.1), cells=(2, 8, 2), gravity=(6.0, -9.8, 0.0), youngs=1e5),
-        leaning(0.6, turn=(30.0, 10.0, 35.0), size=(0.2, 0.2, 0.2), cells=(3, 3, 3), youngs=1e5), rolling(),
-    ],
-    ids=["corner", "smooth", "slides", "edge", "cube", "rolls"],
-)  # fmt: skip
-def test_nothing_moves_once_iterations_have_converged(case: Case) -> None:
-    """What rigid motions do is what converged steps do as well: they never lead away from one."""
-    x, v = case.positions, case.velocities
-    for _ in range(3):
-        problem = step_problem(case.scene.values(), x, v, H)
-        still = Still(**{name.name: getattr(problem, name.name) for name in fields(problem)})
-        solved = guarded_chebyshev(still, still.unsolved(), iterations=800).displacement
-        assert np.linalg.norm(problem.residual(solved)) <= 1e-9 * np.linalg.norm(problem.residual(problem.unsolved()))
-        assert np.abs(problem.align(solved) - solved).max() <= 1e-9
-        x, v = x + solved, solved / H
 
 
 @pytest.mark.parametrize("iterations", [0, 1])

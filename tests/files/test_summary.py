@@ -67,9 +67,9 @@ def test_absent_effects_add_no_bytes(dtype: torch.dtype) -> None:
     assert size(bare(pd.Gravity(), pd.Damping(1.0))) == (plan, material)
     assert size(bare(pd.Ground())) == (plan, material + 5)
     assert size(bare(pd.Sphere((0, -1, 0), 0.5))) == (plan, material + 8)
-    # a pin is a number in the plan, and leaves the piece loose; three hold it: its entry in component_size is gone
+    # pins are numbers in the plan
     assert size(bare(lambda body: pd.Pin(body, [0]))) == (plan + 4, material + 4)
-    assert size(bare(lambda body: pd.Pin(body, [0, 1, 3]))) == (plan + 8, material + 12)
+    assert size(bare(lambda body: pd.Pin(body, [0, 1, 3]))) == (plan + 12, material + 12)
 
 
 def test_absent_effects_change_no_bits(dtype: torch.dtype, device: torch.device) -> None:

@@ -67,7 +67,17 @@ def rounded_problem(case: Case, dtype: torch.dtype) -> StepProblem:
 
 def first_of(problem: StepProblem, case: Case, solver: pd.Jacobi | pd.Chebyshev) -> Array:
     """The iterate that `solver` begins with, in the reference."""
-    return problem.first_iterate(case.start, weighted=solver.settings()["weighted"])
+    return problem.with_diagonal(weighted=solver.settings()["weighted"]).first_iterate(case.start)
+
+
+def ended_by_rounding(problem: StepProblem, displacement: Array) -> float:
+    """How far rounding may move an iterate, relative to it, where contacts touch.
+
+    Coarse corrections with friction converge linearly, and end at 1e-7 of the size: rounding may add one more step.
+    """
+    size = float(np.ptp(problem.positions, axis=0).max())
+    contacts = len(problem.values.planes) + len(problem.values.spheres)
+    return 1e-7 * size / float(np.abs(displacement).max()) if contacts else 0.0
 
 
 def reference_run(
@@ -100,10 +110,10 @@ def reference_runs(
     """What `reference_run` gives for each of some counts, from one run; `energies` has that of its end."""
     seen: dict[int, Array] = {}
     run = reference_run(problem, first, solver, max(counts), seen.__setitem__)
-    diagonal = problem.weighted_diagonal if solver.settings()["weighted"] else problem.plain_diagonal
+    weighed = problem.with_diagonal(weighted=solver.settings()["weighted"])
     for count in counts:
-        u = problem.align(seen[count])
-        residual = problem.relative_residual(u, diagonal)
+        u = weighed.align(seen[count])
+        residual = weighed.relative_residual(u)
         restarts = [k for k in run.restarts if k < count]
         yield Iterates(u, residual, count, restarts, [(count, problem.energy(u))])
 

@@ -181,7 +181,7 @@ def test_plans_are_checked(sim: pd.Simulator) -> None:
     none[PATCHES], many[MOST_SLOTS] = 0, 1000
     wrong: list[tuple[str, Tensor, str]] = [
         ("sizes", plan.sizes.long(), r"plan\.sizes .*got Long"),
-        ("sizes", plan.sizes[:-1], r"plan\.sizes .*got Int \[9\]"),
+        ("sizes", plan.sizes[:-1], r"plan\.sizes .*got Int \[10\]"),
         ("sizes", none, r"plan\.sizes .*got 0 patches"),
         ("sizes", many, r".*got 1 patches with up to 1000 of 27 slots"),
         ("sizes", plan.sizes + 1, r"plan\.vertex_order .*got Int \[27\]"),

@@ -173,7 +173,7 @@ def test_a_cut_shares_one_layer_of_vertices(
 
 def test_parts_hold_each_free_vertex_once(plan: Arrays, values: SceneValues) -> None:
     held = np.isin(values.component, values.component[values.pin_vertices])
-    names = ("slot_piece", "patch_part", "part_start", "part_slot", "piece_start", "piece_part")
+    names = ("slot_piece", "patch_part", "part_start", "part_slot", "part_row", "level_sum", "sum_rows", "piece_rows")
     if held.all():
         assert [len(getattr(plan, name)) for name in names] == [0] * len(names)
         return
@@ -185,38 +185,55 @@ def test_parts_hold_each_free_vertex_once(plan: Arrays, values: SceneValues) -> 
         plan.part_slot, np.unique(plan.slot_vertex, return_index=True)[1][plan.slot_vertex[plan.part_slot]]
     )
     assert len(plan.patch_part) == len(plan.patch_pairs) + 1
-    assert len(plan.part_start) == len(plan.piece_part) + 1
+    assert len(plan.part_start) == len(plan.part_row) + 1
     assert (np.diff(plan.part_start) > 0).all()
     part_patch = np.repeat(np.arange(len(plan.patch_pairs)), np.diff(plan.patch_part))
-    seen = []
-    for piece, (a, b) in enumerate(zip(plan.piece_start[:-1], plan.piece_start[1:], strict=True)):
-        parts = plan.piece_part[a:b]
-        seen += list(parts)
-        assert (np.diff(part_patch[parts]) > 0).all()
-        for part in parts:
-            slots = plan.part_slot[plan.part_start[part] : plan.part_start[part + 1]]
-            assert (np.diff(slots) > 0).all()
-            assert (slots >= plan.patch_slot[part_patch[part]]).all()
-            assert (slots < plan.patch_slot[part_patch[part] + 1]).all()
-            assert (plan.slot_piece[slots] == piece).all()
-    assert sorted(seen) == list(range(len(plan.piece_part)))
+    part_piece = plan.slot_piece[plan.part_slot[plan.part_start[:-1]]]
+    np.testing.assert_array_equal(np.argsort(plan.part_row), np.lexsort((part_patch, part_piece)))
+    for part, (a, b) in enumerate(itertools.pairwise(plan.part_start)):
+        slots = plan.part_slot[a:b]
+        assert (np.diff(slots) > 0).all()
+        assert (slots >= plan.patch_slot[part_patch[part]]).all()
+        assert (slots < plan.patch_slot[part_patch[part] + 1]).all()
+        assert (plan.slot_piece[slots] == part_piece[part]).all()
     moving = plan.slot_piece >= 0
     pairs = np.unique(np.stack([plan.slot_piece[moving], values.component[user[moving]]]), axis=1)
-    np.testing.assert_array_equal(pairs[0], np.arange(len(plan.piece_start) - 1))  # one component each
+    np.testing.assert_array_equal(pairs[0], np.arange(len(plan.piece_rows)))  # one component each
     assert len(np.unique(pairs[1])) == len(pairs[1])
 
 
 @pytest.mark.parametrize("kernel", [BLOCK, GRID, STREAM])
-def test_parts_of_a_block_keep_all_its_warps_busy(case: tuple[str, int], kernel: int) -> None:
-    """64 vertices at most, in order, and full but for the last of a piece in a patch."""
+def test_a_lane_has_one_vertex_of_a_part(case: tuple[str, int], kernel: int) -> None:
+    """32 at most, and 32 but for the last of a piece in a patch."""
     plan = arrays_of(case, kernel)
     sizes = np.diff(plan.part_start)
     for first, last in itertools.pairwise(plan.patch_part):
         pieces = plan.slot_piece[plan.part_slot[plan.part_start[first:last]]]
         for piece in np.unique(pieces):
             mine = sizes[first:last][pieces == piece]
-            if kernel == BLOCK:
-                assert (mine[:-1] == 64).all()
-                assert mine[-1] <= 64
-            else:
-                assert len(mine) == 1
+            assert (mine[:-1] == 32).all()
+            assert 0 < mine[-1] <= 32
+
+
+@pytest.mark.parametrize("cells", [(2, 2, 2), (15, 3, 3), (40, 14, 14)])
+def test_sums_of_at_most_32_rows_add_up_every_part_of_a_piece(cells: tuple[int, int, int]) -> None:
+    small, large = box((1.0, 1.0, 1.0), (1, 1, 1)), box((1.0, 1.0, 1.0), cells)
+    bodies = [pd.Solid(pd.TetMesh(v + [2.0 * i, 0.0, 0.0], t), 1e5) for i, (v, t) in enumerate((small, large, small))]
+    plan = Arrays.of(pd.Scene(*bodies).values(), 7)
+    parts = len(plan.part_row)
+    rows = np.zeros((parts + len(plan.sum_rows), parts), np.int64)  # how often a row has each part
+    rows[plan.part_row, np.arange(parts)] = 1
+    ready = parts
+    for first, last in itertools.pairwise(plan.level_sum):
+        assert last > first
+        for number in range(first, last):
+            a, b = plan.sum_rows[number]
+            assert 0 < b - a <= 32
+            assert b <= ready
+            rows[parts + number] = rows[a:b].sum(axis=0)
+        ready = parts + last
+    assert ready == len(rows)
+    part_piece = plan.slot_piece[plan.part_slot[plan.part_start[:-1]]]
+    for piece, (a, b) in enumerate(plan.piece_rows):
+        assert 0 < b - a <= 32
+        np.testing.assert_array_equal(rows[a:b].sum(axis=0), part_piece == piece)

@@ -58,7 +58,6 @@ def test_kernels_differ_in_rest_shapes_and_in_how_patches_exchange_alone(case: t
     """So that what is shown of the plan for one of them holds for all but a cluster: see test_cluster_plan.py."""
     plans = {kernel: arrays_of(case, kernel) for kernel in KERNELS if kernel != CLUSTER}
     own = {"sizes", "pair_rest", "pair_factor", "slot_rest", "slot_fixed", "patch_unit", "slot_sender", "shared_place"}
-    parts = {"patch_part", "part_start", "piece_start", "piece_part"}  # of 64 vertices at most in a block
     entries = {"pair_corner": 65535, "slot_row": 32767 << 16}  # what is not an entry, which a pipeline has elsewhere
     for kernel, plan in plans.items():
         assert len(plan.slot_copy) == 0
@@ -66,7 +65,7 @@ def test_kernels_differ_in_rest_shapes_and_in_how_patches_exchange_alone(case: t
             array, expected = getattr(plan, row.name), getattr(plans[GRID], row.name)
             if kernel == STREAM and row.name in entries:
                 array, expected = array & entries[row.name], expected & entries[row.name]
-            if row.name not in own and not (kernel == BLOCK and row.name in parts):
+            if row.name not in own:
                 np.testing.assert_array_equal(array, expected, row.name)
     assert len(plans[BLOCK].slot_sender) == len(plans[STREAM].slot_sender) == 0
     assert len(plans[BLOCK].shared_place) == len(plans[GRID].shared_place) == 0
@@ -268,7 +267,9 @@ def test_sizes_count_the_arrays(kernel: int, case: tuple[str, int], values: Scen
         "patches": len(plan.patch_pairs),
         "slots": len(plan.slot_vertex),
         "shared": len(plan.shared_start) - 1,
-        "parts": len(plan.piece_part),
+        "parts": len(plan.part_row),
+        "sums": len(plan.sum_rows),
+        "sum_levels": max(len(plan.level_sum) - 1, 0),
         "senders": len(plan.slot_sender),
         "most_slots": np.diff(plan.patch_slot).max(),
         "most_pairs": plan.patch_pairs.max(),
@@ -276,6 +277,7 @@ def test_sizes_count_the_arrays(kernel: int, case: tuple[str, int], values: Scen
         "most_interior": np.diff(plan.patch_vertex).max(),
         "members": 0,
         "environments": 0,
+        "solid_pieces": len(free),
     }
     assert dict(zip(SIZES, plan.sizes.tolist(), strict=True)) == expected
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sheets import cloth, surface
 
 import torchpd as pd
-from torchpd.common.tables import KINDS, ROW_SIZES
+from torchpd.common.tables import DEVICE_SIZES, KINDS, ROW_SIZES
 from torchpd.plan.cpu_plan import Plan
 from torchpd.plan.gpu_plan import compile_device_plan, device_table
 from torchpd.plan.kernel_choice import shared_bytes
@@ -187,7 +187,7 @@ def test_every_entry_of_a_step_has_one_writer(built: tuple[Case, SceneValues, Ar
     np.testing.assert_array_equal(np.bincount(row, minlength=len(step)), step >> 16 & 32767)
     assert ((step ^ plan.slot_row.view(np.uint32)) >> 31 == 0).all()
     most = plan.row_sizes[ROW_SIZES["step_entries"]]
-    assert entry.max() < most <= plan.sizes[13]
+    assert entry.max() < most <= plan.sizes[DEVICE_SIZES.index("most_entries")]
 
 
 def test_float32_rows_are_as_near_as_stencils() -> None:

@@ -163,9 +163,10 @@ def test_loose_pieces_are_numbered(plan: Plan, values: SceneValues) -> None:
         points = values.rest_positions[hard[values.component[hard] == number]]
         held |= (values.component == number) & (np.linalg.matrix_rank(points - points[0]) > 1)
     np.testing.assert_array_equal(group < 0, held)
-    sizes = plan.component_size.numpy()
-    np.testing.assert_array_equal(np.bincount(group[group >= 0], minlength=len(sizes)), sizes)
-    for number in range(len(sizes)):
+    numbers = np.unique(group[group >= 0])
+    np.testing.assert_array_equal(numbers, np.arange(int(plan.sizes[3])))
+    assert int(plan.sizes[-1]) == len(numbers)  # of tetrahedra alone
+    for number in numbers:
         assert len(np.unique(values.component[group == number])) == 1
 
 
@@ -228,11 +229,11 @@ def test_plan_to_keeps_integers(plan: Plan) -> None:
 
 
 def test_sizes_count_what_the_arrays_hold(plan: Plan, values: SceneValues) -> None:
-    slots = plan.patch_slot.diff()
+    slots, components = plan.patch_slot.diff(), int(plan.vertex_component.max()) + 1
     assert plan.sizes.tolist() == [
-        len(values.rest_positions), len(values.tets), len(values.pin_vertices), len(plan.component_size),
-        len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
-        plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()), 1,
+        len(values.rest_positions), len(values.tets), len(values.pin_vertices),
+        components, len(plan.tet_rest), plan.patches, len(plan.slot_vertex),
+        plan.vertices - int(plan.patch_vertex[-1]), int(slots.max()), 1, components,
     ]  # fmt: skip
 
 
@@ -245,6 +246,17 @@ def test_sizes_stay_on_the_cpu(plan: Plan) -> None:
 def test_compiling_twice_gives_the_same_plan(values: SceneValues) -> None:
     one, other = (compile_plan(values, dtype=torch.float64) for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(one.arrays, other.arrays, strict=True))
+
+
+def test_the_number_of_threads_changes_nothing(values: SceneValues) -> None:
+    plans, before = [], torch.get_num_threads()
+    for threads in (1, 3):
+        try:
+            torch.set_num_threads(threads)
+            plans.append(compile_plan(values, dtype=torch.float64, patch_size=16))
+        finally:
+            torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*(plan.arrays for plan in plans), strict=True))
 
 
 def test_large_meshes_show_progress(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,10 +15,11 @@ from programs import ROOT
 import torchpd as pd
 from torchpd.reference import StepProblem, nearest_rotation, step_problem
 from torchpd.reference.coarse import RigidMotions, correct
-from torchpd.reference.coarse_step import coarse_chebyshev, corrected, first_iterate
+from torchpd.reference.coarse_step import coarse_chebyshev
 from torchpd.reference.envelopes import contacts_at, pushes_of
 from torchpd.reference.piece_step import piece_motions
 from torchpd.reference.pieces import PieceSpace, cut
+from torchpd.reference.rigid import corrected
 
 Array = NDArray[np.float64]
 H = 1.0 / 60.0
@@ -330,7 +331,7 @@ def test_bodies_alone_and_together_have_the_same_bits() -> None:
         x = np.concatenate([bodies[i].mesh.vertices for i in chosen])
         v = np.concatenate([velocities[i] for i in chosen])
         problem = step_problem(pd.Scene(*(bodies[i] for i in chosen), *parts).values(), x, v, H)
-        first = first_iterate(problem, H * problem.velocities)
+        first = problem.first_iterate()
         return corrected(problem, first)
 
     together = steps([0, 1])

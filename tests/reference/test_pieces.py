@@ -23,9 +23,10 @@ from stretch_cases import small_body
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
-from torchpd.reference.coarse_step import coarse_chebyshev, corrected
+from torchpd.reference.coarse_step import coarse_chebyshev
 from torchpd.reference.piece_step import PieceCycle, piece_motions
 from torchpd.reference.pieces import Pieces, PieceSpace, cut
+from torchpd.reference.rigid import corrected
 from torchpd.reference.solvers import newton, preconditioned_lbfgs, relative_error
 
 Array = NDArray[np.float64]

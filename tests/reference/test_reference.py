@@ -377,17 +377,6 @@ def test_moving_sphere_drags_what_sticks_to_it() -> None:
     assert np.abs(slip).max() <= 1e-12
 
 
-def test_a_body_on_the_ground_is_not_moved_into_it() -> None:
-    """Two blocks, one in the air: it falls exactly, the one on the ground stays."""
-    low, high = contact_block(), contact_block(height=3.0)
-    bodies = [Solid(TetMesh(case.positions, case.scene.values().tets), youngs=1e5) for case in (low, high)]
-    values = Scene(*bodies, Gravity(GRAVITY), Ground(height=0.0)).values()
-    problem = step_problem(values, values.rest_positions, 0.0 * values.rest_positions, 1.0 / 60.0)
-    first = problem.first_iterate()
-    np.testing.assert_allclose(first[:64], 0.0, atol=1e-17)
-    np.testing.assert_allclose(first[64:], np.tile(GRAVITY / 3600.0, (64, 1)), atol=1e-15)
-
-
 def test_friction_makes_the_guard_lenient() -> None:
     assert guard_tolerance(contact_block(Ground()).problem()) == 1e-5
     assert guard_tolerance(contact_block(Ground(), Ground(friction=0.1)).problem()) == 1e-2

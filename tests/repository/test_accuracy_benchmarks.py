@@ -304,20 +304,19 @@ def test_tumbles_count_what_rigid_motions_take_elsewhere() -> None:
 
 
 @pytest.mark.usefixtures("on_path")
-@pytest.mark.parametrize(("number", "moves"), [(2, False), (111, True)], ids=["stays", "is taken elsewhere"])
-def test_tumbles_tell_rigid_motions_from_iterations(number: int, moves: bool) -> None:
-    """With friction of 2 a body may stick as well as slide: what iterations have solved is not what it is left with."""
+@pytest.mark.parametrize("number", [2, 111])
+def test_what_iterations_solve_stays(number: int) -> None:
+    """With friction of 2 a body may stick as well as slide: a rigid one has a solution elsewhere, too."""
     import tumbles
 
     _, sim, state = tumbles.random_tumble(np.random.default_rng([tumbles.SEED, number]))
     before = state.positions[0].numpy(), state.velocities[0].numpy()
     problem = tumbles.step_problem(sim.scene.values(), *before, sim.time_step)
     after = sim.time_step * sim(state).velocities[0].detach().numpy()
-    assert (tumbles.residual_of(problem, after) > 0.1) == moves
+    assert tumbles.residual_of(problem, after) <= 1e-8
     found = tumbles.judge(problem, after)
     assert found["residual of iterations"] <= 1e-8
-    assert (found["moved"] > 1e-4) == moves
-    assert moves or found["moved"] <= 1e-9
+    assert found["moved"] <= 1e-9
 
 
 @pytest.mark.usefixtures("on_path")

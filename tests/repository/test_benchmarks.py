@@ -189,6 +189,17 @@ def test_multilevel_counts_iterations_with_stiff_pieces() -> None:
         assert counts[-1] < 40
 
 
+def test_set_up_times_every_stage(tmp_path: Path) -> None:
+    out = tmp_path / "set-up.json"
+    command = [sys.executable, "benchmarks/set_up.py", "--cells", "3", "--plans", "4", "--out", str(out)]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert "256 vertices, 810 tetrahedra" in result.stdout
+    box, plans = json.loads(out.read_text())["rows"]
+    assert list(box["stages"]) == ["simulator", "gpu plan", "levels", "gpu levels"]
+    assert list(plans["stages"]) == ["simulator", "gpu plan"]
+    assert all(stage["processor_seconds"] > 0.0 for stage in box["stages"].values())
+
+
 @pytest.fixture
 def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmarks are scripts, which find each other in their folder."""

@@ -251,7 +251,7 @@ def test_only_what_pins_clamp_everywhere_is_left_out() -> None:
     assert groups(clamped) == [-1, -1]
     sim.set_material(pin_hard=torch.cat([torch.ones(9) > 0, torch.zeros(9) > 0]))
     assert groups(sim.plan) == [-1, 0]
-    assert sim.plan.sizes[3] == 1 == len(sim.plan.component_size)
+    assert sim.plan.sizes[3] == 1 == sim.plan.sizes[-1]
     one = sim.plan
     sim.set_material(pin_hard=True)
     sim.set_material(pin_hard=torch.cat([torch.ones(9) > 0, torch.zeros(9) > 0]))

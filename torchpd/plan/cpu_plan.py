@@ -37,7 +37,7 @@ Reals = NDArray[np.float64]
 _WORTH_A_BAR = 200_000  # tetrahedra from which a progress bar is shown
 # in the order of their numbers in the `sizes` of a GPU plan
 KERNELS = ("block", "cluster", "grid", "stream")
-_SIZE_COMPONENTS = 3  # place in PlanSize of csrc/views/views.h
+_SIZE_COMPONENTS, _SIZE_SOLID = 3, 10  # places in PlanSize of csrc/views/views.h
 
 
 def kernel_of(arrays: Sequence[Tensor]) -> str:
@@ -172,32 +172,35 @@ def quoted_choices(names: Sequence[str]) -> str:
     return f"{', '.join(before)} or {last}" if before else last
 
 
-def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Number of the rigidly moving component of each vertex [V] (-1: none), and the vertex count of each one."""
-    number = np.where(values.loose, np.cumsum(values.loose) - 1, -1)
-    group = number[values.component].astype(np.int32)
-    return group, np.bincount(group[group >= 0], minlength=int(values.loose.sum())).astype(np.int32)
+def loose_pieces(values: SceneValues) -> tuple[NDArray[np.int32], int, int]:
+    """Number of the rigidly moving component of each vertex [V] (-1: none), their count, and how many are solid.
+
+    Solid ones come first.
+    """
+    number = np.full(len(values.loose), -1)
+    order = np.concatenate([np.flatnonzero(values.loose & solid) for solid in (values.solid, ~values.solid)])
+    number[order] = np.arange(len(order))
+    return number[values.component].astype(np.int32), len(order), int((values.loose & values.solid).sum())
 
 
 def with_loose_components(plan: Plan, values: SceneValues) -> Plan:
     """Copy of a CPU plan for another set of components that a step may move rigidly."""
     if plan.kernel is not None:
         raise ValueError("with_loose_components: plan must be a CPU plan, got a GPU plan; compile it again")
-    group, component_size = (tensor_of(array) for array in loose_pieces(values))
+    group, *counts = loose_pieces(values)
     sizes = plan.sizes.clone()
-    sizes[_SIZE_COMPONENTS] = len(component_size)
-    new = {"vertex_component": group[plan.vertex_order.long()], "component_size": component_size, "sizes": sizes}
+    sizes[_SIZE_COMPONENTS], sizes[_SIZE_SOLID] = counts
+    new = {"vertex_component": tensor_of(group)[plan.vertex_order.long()], "sizes": sizes}
     arrays = tuple(new.get(row.name, array) for row, array in zip(plan.table, plan.arrays, strict=True))
     return replace(plan, arrays=arrays, loose=values.loose)
 
 
-def _sizes(arrays: dict[str, NDArray[Any]], tets: int, members: Any) -> NDArray[np.int32]:
+def _sizes(arrays: dict[str, NDArray[Any]], tets: int, components: int, solid: int, members: Any) -> NDArray[np.int32]:
     """Counts of a CPU plan, in the order of PlanSize in csrc/views/views.h."""
     slots = np.diff(arrays["patch_slot"])
     counts = (
-        len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), len(arrays["component_size"]),
-        len(arrays["tet_order"]), len(slots), len(arrays["slot_vertex"]), len(arrays["shared_start"]) - 1, slots.max(),
-        members,
+        len(arrays["vertex_order"]), tets, len(arrays["pin_vertex"]), components, len(arrays["tet_order"]),
+        len(slots), len(arrays["slot_vertex"]), len(arrays["shared_start"]) - 1, slots.max(), members, solid,
     )  # fmt: skip
     return np.array(counts, dtype=np.int32)
 
@@ -245,11 +248,10 @@ def compile_plan(
         )
     members = arrays.pop("members")
     internal = internal_numbers(arrays["vertex_order"])
-    group, component_size = loose_pieces(values)
+    group, components, solid = loose_pieces(values)
     arrays["vertex_component"] = group[arrays["vertex_order"]]
-    arrays["component_size"] = component_size
     arrays["pin_vertex"] = internal[values.pin_vertices].astype(np.int32)
-    arrays["sizes"] = _sizes(arrays, tets, members)
+    arrays["sizes"] = _sizes(arrays, tets, components, solid, members)
     table = PLAN_TABLE + STENCIL_TABLE if stencils else PLAN_TABLE
     tensors = (tensor_of(arrays[row.name]) for row in table)
     reals = tuple(t.to(dtype) if t.is_floating_point() else t for t in tensors)

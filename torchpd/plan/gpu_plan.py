@@ -17,7 +17,7 @@ from .cpu_plan import KERNELS, compile_progress, internal_numbers, loose_pieces,
 
 __all__ = ["compile_device_plan", "device_table"]
 
-_SIZE_PINS = DEVICE_SIZES.index("pins")
+_SIZE_PINS, _SIZE_SOLID = DEVICE_SIZES.index("pins"), DEVICE_SIZES.index("solid_pieces")
 
 
 def device_table(values: SceneValues) -> tuple[PlanRow, ...]:
@@ -47,7 +47,7 @@ def compile_device_plan(
         raise ValueError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     if kernel not in range(len(KERNELS)):
         raise ValueError(f"kernel must be 0, 1, 2 or 3, got {kernel}")
-    piece, _ = loose_pieces(values)
+    piece, _, solid = loose_pieces(values)
     elements = len(values.tets) + sum(len(group) for group in values.stencils)
     with compile_progress(elements, progress) as advance:
         arrays: dict[str, NDArray[Any]] = _C.build_device_plan(
@@ -56,6 +56,7 @@ def compile_device_plan(
         )  # fmt: skip
     pins = len(values.pin_vertices)
     arrays["sizes"][_SIZE_PINS] = pins
+    arrays["sizes"][_SIZE_SOLID] = solid
     if pins:
         arrays["pin_vertex"] = internal_numbers(arrays["vertex_order"])[values.pin_vertices]
         arrays["vertex_pin"] = np.full(len(values.rest_positions), -1, dtype=np.int32)

@@ -28,19 +28,21 @@ from .envelopes import Envelopes, PairContacts, contacts_at
 from .geometry import twists
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-OUTER = 6  # finite motions
+OUTER = 10  # finite motions
 PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-STILL = 1e-6  # of the size of a body, and of the friction radii: a step that ends the passes
-NEAR = 1e-3  # of the size: a step within which friction radii move half way to friction l
+STILL = 1e-7  # of the size of a body: a step that may be left
+LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
+EARLY = 1e-3  # both, before the iterations
+SETTLED = 0.1  # of a motion: a next step that ends it, once friction radii follow; of these: a lag made up at once
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
@@ -51,7 +53,7 @@ class Motions(ABC):
     All sums run over the vertices of the island alone, so that their bits do not depend on other bodies.
     """
 
-    problem: StepProblem
+    problem: Objective
     displacement: Array  # [V, 3] m, of the whole scene
     bodies: tuple[Index, ...]  # vertices of every body
 
@@ -199,7 +201,7 @@ class RigidMotions(Motions):
 
 
 # makes the motions of an island from the problem, the displacement and the vertices of its bodies
-MotionsOf = Callable[["StepProblem", Array, tuple[Index, ...]], Motions]
+MotionsOf = Callable[["Objective", Array, tuple[Index, ...]], Motions]
 
 
 class Correction(NamedTuple):
@@ -208,15 +210,17 @@ class Correction(NamedTuple):
     displacement: Array  # [V, 3] m
     forces: Array  # [m, 3] N of the pairs
     energies: Array  # [components] J: Phi of its island, before the pushes; inf where pins leave no motion
+    pushes: Array  # [V, 3] m: after the motion, by the contacts and the projection
 
 
 def correct(
-    problem: StepProblem,
+    problem: Objective,
     displacement: Array,
     forces: Array,
     pairs: PairContacts | None = None,
     *,
     motions: MotionsOf = RigidMotions,
+    early: bool = False,
 ) -> Correction:
     """The coarse correction of every island.
 
@@ -226,20 +230,22 @@ def correct(
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
         motions: makes the motions of an island.
+        early: whether iterations go on from it, so that it may end sooner.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
-    energies = np.full(int(problem.values.component.max()) + 1, np.inf)
+    energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
     for bodies, of in islands(problem, pairs):
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, each, energy = _correct_island(moving, forces, own)
+        corrected, push, each, energy = _correct_island(moving, forces, own, early)
+        pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
         energies[problem.values.component[[body[0] for body in bodies]]] = energy
-    return Correction(corrected, after, energies)
+    return Correction(corrected, after, energies, pushes)
 
 
-def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
+def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
     """The bodies of every island, as their vertices, and the numbers of its pairs."""
     component = problem.values.component
     ends = np.zeros((0, 2), np.int64) if pairs is None else component[pairs.vertices[:, [0, 3]]]
@@ -252,14 +258,20 @@ def islands(problem: StepProblem, pairs: PairContacts | None = None) -> Iterator
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, float]:
-    """Displacement [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
+def _correct_island(
+    motions: Motions, forces: Array, pairs: PairContacts | None, early: bool
+) -> tuple[Array, Array, Array, float]:
+    """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
+    still, behind = (EARLY, EARLY) if early else (STILL, LAG)
+    phi = motions.energy + contacts.energy(radius)
     for _ in range(OUTER):
-        motion, radius = _model_minimum(motions, contacts, radius)
-        phi = energy = motions.energy + contacts.energy(radius)
+        motion, radius = _model_minimum(motions, contacts, radius, still, behind)
+        if not motion.any():
+            break
+        energy = motions.energy + contacts.energy(radius)
         for _ in range(CUTS + 1):
             trial = motions.after(motion)
             after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
@@ -270,18 +282,18 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
             motion = 0.5 * motion
         else:
             break
-        share = motions.share(motion)
         motions, contacts, phi = trial, after, reached
-        if share <= STILL:
-            break
-    return _pushed(motions, contacts, radius), contacts.forces(radius), phi
+    return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
-def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+def _model_minimum(
+    motions: Motions, contacts: Envelopes, radius: Array, still: float, behind: float
+) -> tuple[Array, Array]:
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
-    Newton's steps, each ended where the model is least along it. Radii move half way to friction l where a step is near
-    enough to the minimum.
+    Newton's steps, each ended where the model is least along it. Where the next one is small beside the motion, radii
+    go half way to friction l, unless they are near: what friction does to normal forces may drive them up and down. No
+    motion where the first step is small.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -294,6 +306,14 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
         force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion
         # a line has no inertia about itself
         step = np.linalg.lstsq(matrix, force, rcond=1e-12)[0]
+        if motions.share(step) <= max(still, SETTLED * motions.share(motion)):
+            lag = contacts.friction * trial.normal_forces() - radius
+            left, size = np.linalg.norm(lag), np.linalg.norm(radius)
+            if left <= behind * size:
+                motion = motion + step if motion.any() else motion
+                break
+            radius = radius + (1.0 if left <= SETTLED * size else 0.5) * lag
+            continue
         way, linear, quadratic = jacobian @ step, float(force @ step), float(step @ hessian @ step)
         linear -= float((way * trial.forces(radius)).sum())
 
@@ -312,17 +332,12 @@ def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tupl
             for _ in range(30):
                 middle = 0.5 * (low + high)
                 low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
-        motion, share = motion + high * step, motions.share(high * step)
-        lag = contacts.friction * contacts.shifted(jacobian @ motion).normal_forces() - radius
-        if share <= STILL and np.linalg.norm(lag) <= STILL * np.linalg.norm(radius):
-            break
-        if share <= NEAR:
-            radius = radius + 0.5 * lag
+        motion = motion + high * step
     return motion, radius
 
 
-def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
-    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection of the island.
+def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection, and these changes.
 
     A vertex that touches several planes and spheres is pushed by one after another.
     """
@@ -337,10 +352,10 @@ def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
         push = each.weights[:, :, None] * (each.shifted(way).forces(radius[of]) - before)[:, None, :]
         forces = np.zeros_like(pushed)
         np.add.at(forces, each.vertices.reshape(-1), push.reshape(-1, 3))
-        pushed = pushed + np.where(problem.free[:, None], forces / problem.weighted_diagonal[:, None], 0.0)
+        pushed = pushed + np.where(problem.free[:, None], forces / problem.diagonal[:, None], 0.0)
     moved = motions.displacement.copy()
     moved[own] = problem.project(pushed)[own]
-    return moved
+    return moved, moved - motions.displacement
 
 
 def _cross(vectors: Array) -> Array:

@@ -22,7 +22,7 @@ from ..common.tables import PLANES, SPHERES
 from .geometry import sphere_normals
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["Envelopes", "PairContacts", "contacts_at", "pushes_of"]
 
@@ -108,25 +108,30 @@ class Envelopes:
 
 
 def contacts_at(
-    problem: StepProblem, displacement: Array, forces: Array, vertices: Index, pairs: PairContacts | None = None
+    problem: Objective, displacement: Array, forces: Array, vertices: Index, pairs: PairContacts | None = None
 ) -> Envelopes:
     """Contacts of free vertices with all planes and spheres, then the pairs, at an iterate.
 
-    `forces` [C, V, 3] N are those of every plane and sphere (`pushes_of`).
+    `forces` [C, V, 3] N are those of every plane and sphere (`pushes_of`). P projects out of one after another; so each
+    has its gap and slip where P comes to it: before the pushes of those after it.
     """
     values, free = problem.values, vertices[problem.free[vertices]]
     u, y = displacement[free], problem.positions[free] + displacement[free]
     normals, gaps, slips, friction = [np.zeros((0, 3))], [np.zeros(0)], [np.zeros((0, 3))], [np.zeros(0)]
-    for plane in values.planes:
+    # how far the contacts after each one push a vertex in a plain iteration
+    onto = np.cumsum(forces[::-1, free], axis=0)[::-1] - forces[:, free]
+    onto /= problem.diagonal[free, None]
+    for plane, later in zip(values.planes, onto, strict=False):
         normals.append(np.tile(plane[PLANES["normal"]], (len(free), 1)))
-        gaps.append(y @ plane[PLANES["normal"]] - plane[PLANES["height"]])
-        slips.append(u)
+        gaps.append((y - later) @ plane[PLANES["normal"]] - plane[PLANES["height"]])
+        slips.append(u - later)
         friction.append(np.full(len(free), plane[PLANES["friction"]]))
-    for center, motion, sphere in zip(problem.sphere_centers, problem.sphere_motions, values.spheres, strict=True):
+    spheres = zip(problem.sphere_centers, problem.sphere_motions, values.spheres, strict=True)
+    for (center, motion, sphere), later in zip(spheres, onto[len(values.planes) :], strict=True):
         outward, lengths = sphere_normals(y, center)
         normals.append(outward)
-        gaps.append(lengths - sphere[SPHERES["radius"]])
-        slips.append(u - motion)
+        gaps.append(lengths - (later * outward).sum(axis=1) - sphere[SPHERES["radius"]])
+        slips.append(u - motion - later)
         friction.append(np.full(len(free), sphere[SPHERES["friction"]]))
     index = np.tile(free, len(values.planes) + len(values.spheres))[:, None]
     weights, anchors = np.ones(index.shape), forces[:, free].reshape(-1, 3)
@@ -141,7 +146,7 @@ def contacts_at(
         weights = np.concatenate([np.pad(weights, ((0, 0), (0, 3))), pairs.weights])
         anchors = np.concatenate([anchors, pairs.forces])
     normal = np.concatenate(normals)
-    inverse = np.where(problem.free[index], weights**2 / problem.weighted_diagonal[index], 0.0).sum(axis=1)
+    inverse = np.where(problem.free[index], weights**2 / problem.diagonal[index], 0.0).sum(axis=1)
     contacts = Envelopes(
         vertices=index,
         weights=weights,
@@ -157,9 +162,9 @@ def contacts_at(
     return replace(contacts, slips=along(contacts.slips), tangent_anchors=along(anchors))
 
 
-def pushes_of(problem: StepProblem, displacement: Array, gradient: Array) -> Array:
+def pushes_of(problem: Objective, displacement: Array, gradient: Array) -> Array:
     """Forces [C, V, 3] N of every plane and sphere in the next plain iteration: D times what P(u - g / D) moves."""
-    scale = problem.weighted_diagonal[:, None]
+    scale = problem.diagonal[:, None]
     before, forces = displacement - gradient / scale, []
     for after in problem.projections(before, displacement):
         forces.append(np.where(problem.free[:, None], scale * (after - before), 0.0))

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-__all__ = ["Elements", "elements", "gradient_operator", "sphere_normals", "spreads", "twists"]
+from ..common.tables import PLANES, SPHERES
+
+__all__ = ["Elements", "elements", "gaps_of", "gradient_operator", "sphere_normals", "spreads", "twists"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -66,3 +68,13 @@ def twists(arms: Array) -> Array:
     for k in range(3):
         modes[:, :, 3 + k] = np.cross(np.eye(3)[k], arms)
     return modes
+
+
+def gaps_of(positions: Array, planes: Array, centers: Array, spheres: Array) -> Array:
+    """Signed distance [n] m of every position to the nearest plane or sphere; inf without any."""
+    gaps = np.full(len(positions), np.inf)
+    for plane in planes:
+        gaps = np.minimum(gaps, positions @ plane[PLANES["normal"]] - plane[PLANES["height"]])
+    for center, sphere in zip(centers, spheres, strict=True):
+        gaps = np.minimum(gaps, np.linalg.norm(positions - center, axis=1) - sphere[SPHERES["radius"]])
+    return gaps

@@ -14,7 +14,7 @@ from .coarse import Motions, MotionsOf
 from .pieces import Pieces, PieceSpace, thinned
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["PieceCycle", "PieceMotions", "piece_motions"]
 
@@ -91,7 +91,7 @@ class PieceCycle:
     than `SLOW` of half the slope, which they would if H were still what it was. The secant pairs stay.
     """
 
-    problem: StepProblem
+    problem: Objective
     cycle: Callable[[Array], Array]  # applies M
     pieces: Pieces
     remakes: bool = True

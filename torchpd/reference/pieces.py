@@ -22,7 +22,7 @@ from .groups import ElementGroup
 from .laws import Coupling
 
 if TYPE_CHECKING:
-    from .problem import StepProblem
+    from .objective import Objective
 
 __all__ = ["PieceSpace", "Pieces", "cut", "thinned"]
 
@@ -51,7 +51,7 @@ class Pieces:
         return int(self.weights.shape[1])
 
 
-def cut(problem: StepProblem, size: float | None = None, most: int = MOST, blend: int = BLEND) -> Pieces:
+def cut(problem: Objective, size: float | None = None, most: int = MOST, blend: int = BLEND) -> Pieces:
     """Cut every component into pieces of about `size` vertices, and at most `most` pieces.
 
     Lloyd's method, with distances along the couplings of A; weak couplings are long, so that pieces follow the
@@ -78,7 +78,7 @@ def cut(problem: StepProblem, size: float | None = None, most: int = MOST, blend
     return Pieces(of, _blended(problem, of, count, blend))
 
 
-def _blended(problem: StepProblem, of: Index, count: int, sweeps: int) -> csr_array:
+def _blended(problem: Objective, of: Index, count: int, sweeps: int) -> csr_array:
     """Weights [V, P] of pieces: one in each, then smoothed and scaled to add up to one."""
     free = np.flatnonzero(problem.free)
     weights = csr_array((np.ones(len(free)), (free, of[free])), shape=(len(of), count))
@@ -110,7 +110,7 @@ def thinned(pieces: Pieces) -> Pieces:
     return Pieces(pieces.of, csr_array((entries, (rows, columns)), shape=weights.shape))
 
 
-def _lengths(problem: StepProblem, own: Index) -> csr_array:
+def _lengths(problem: Objective, own: Index) -> csr_array:
     """Graph of the couplings of some vertices: distance / clip(strength / upper quartile, 0.01, 1) [m]."""
     matrix = coo_array(problem.matrix[own][:, own])
     apart = (matrix.row != matrix.col) & (matrix.data != 0.0)
@@ -167,7 +167,7 @@ def _deepest(graph: csr_array, label: Index, centres: Index) -> Index:
 class PieceSpace:
     """The coarse space of pieces at an iterate, and the matrices of the step reduced to it: N unknowns."""
 
-    problem: StepProblem
+    problem: Objective
     pieces: Pieces
     displacement: Array  # [V, 3] m, where it was made
 

@@ -57,14 +57,13 @@ def _iterate(
     first: Array,
     schedule: Plain | Classic | Guarded,
     *,
-    diagonal: Array,
     relaxation: float,
     iterations: int,
     tolerance: float,
     observe: Observer | None,
 ) -> Iterates:
     """Run u_{k+1} = P(u_{k-1} + omega_k (u_k - theta g / D - u_{k-1})), u_{-1} = u_0."""
-    result = Iterates(first, 1.0, 0)
+    result, diagonal = Iterates(first, 1.0, 0), problem.diagonal
     least = float((problem.weight / diagonal)[problem.free].min(initial=1.0))
     slowest, left = max(1.0 - relaxation * least, 0.0), 0.0
     previous = current = first
@@ -89,7 +88,7 @@ def _iterate(
                 result.converged = True
                 break
     result.displacement = problem.align(current)
-    result.residual = problem.relative_residual(result.displacement, diagonal)
+    result.residual = problem.relative_residual(result.displacement)
     return result
 
 
@@ -125,9 +124,8 @@ def jacobi(
     observe: Observer | None = None,
 ) -> Iterates:
     """Jacobi iteration; `observe(k, u_k)` is called with every iterate from the first update on."""
-    diagonal = problem.weighted_diagonal if weighted else problem.plain_diagonal
-    return _iterate(problem, first, Plain(), diagonal=diagonal, relaxation=relaxation, iterations=iterations,
-                    tolerance=tolerance, observe=observe)  # fmt: skip
+    return _iterate(problem.with_diagonal(weighted=weighted), first, Plain(), relaxation=relaxation,
+                    iterations=iterations, tolerance=tolerance, observe=observe)  # fmt: skip
 
 
 def classic_chebyshev(
@@ -143,8 +141,7 @@ def classic_chebyshev(
     observe: Observer | None = None,
 ) -> Iterates:
     """Classic Chebyshev iteration of the source paper; rho estimates the spectral radius of the Jacobi iteration."""
-    diagonal = problem.weighted_diagonal if weighted else problem.plain_diagonal
-    return _iterate(problem, first, Classic(rho, delay), diagonal=diagonal, relaxation=relaxation,
+    return _iterate(problem.with_diagonal(weighted=weighted), first, Classic(rho, delay), relaxation=relaxation,
                     iterations=iterations, tolerance=tolerance, observe=observe)  # fmt: skip
 
 
@@ -166,7 +163,7 @@ def guarded_chebyshev(
     """
     radius = min(0.99999, 1.0 - relaxation * problem.smallest_ratio if rho is None else rho)
     schedule = Guarded(radius, guard_tolerance(problem) if check_tolerance is None else check_tolerance)
-    return _iterate(problem, first, schedule, diagonal=problem.weighted_diagonal, relaxation=relaxation,
+    return _iterate(problem, first, schedule, relaxation=relaxation,
                     iterations=iterations, tolerance=tolerance, observe=observe)  # fmt: skip
 
 

@@ -15,8 +15,10 @@ import torch
 from numpy.typing import NDArray
 
 from ..common.checks import as_array, check_finite, check_scalar, check_shape, check_vector
+from ..common.memory import chunks
 from ..common.synonyms import Renamed, check_arguments
 from ..common.warn import SceneWarning, warn_user
+from ..geometry.mesh_checks import determinants
 from ..geometry.mesh_quality import shape_gradients
 from ..geometry.tet_mesh import TetMesh
 from .averaging import average_over
@@ -195,12 +197,11 @@ class Solid(Body):
         return self._filled(self.density, 0.0)
 
     def masses(self) -> Array:
-        corners = self.mesh.vertices[self.mesh.tets]
-        edges = corners[:, 1:] - corners[:, :1]
-        share = self.filled_density * np.linalg.det(edges) / 24.0
-        count = len(self.mesh.vertices)
-        masses = np.bincount(self.mesh.tets.reshape(-1), weights=np.repeat(share, 4), minlength=count)
-        return masses.astype(np.float64, copy=False)
+        masses, density = np.zeros(len(self.mesh.vertices)), self.filled_density
+        for some in chunks(len(density)):
+            tets = self.mesh.tets[some]
+            np.add.at(masses, tets, (density[some] * determinants(self.mesh.vertices, tets) / 24.0)[:, None])
+        return masses
 
     @cached_property
     def averaging_groups(self) -> Index:

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# pins_apart^2 of csrc/solver/rigid/free_motion.h
+# pins_apart^2 of csrc/solver/coarse/sums.h
 _APART = 1e-8
 
 

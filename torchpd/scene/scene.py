@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -55,6 +56,18 @@ class SceneValues:
     stiffness_damping: Array | None = None  # [E] s, None where no solid has any
     pressure: Array | None = None  # [pressures] Pa, None without any
     wind: Array | None = None  # [3] m/s, None without
+
+    @cached_property
+    def solid(self) -> NDArray[np.bool_]:
+        """Whether all vertices of each component [components] are corners of tetrahedra."""
+        inside = np.zeros(len(self.component), np.bool_)
+        inside[self.tets] = True
+        for group in self.stencils:
+            if group.gradients.shape[2] == 3:  # F maps space
+                inside[group.corners] = True
+        solid = np.ones(len(self.loose), np.bool_)
+        solid[self.component[~inside]] = False
+        return solid
 
 
 def _no_part(part: object) -> TypeError:
@@ -149,8 +162,8 @@ class Scene:
         return self._tets_of(self.solids)
 
     def _tets_of(self, solids: Iterable[Solid]) -> Index:
-        own = (solid.mesh.tets + self.vertex_range(solid).start for solid in solids)
-        return np.concatenate([np.zeros((0, 4), dtype=np.int64), *own])
+        own = [solid.mesh.tets + self.vertex_range(solid).start for solid in solids]
+        return own[0] if len(own) == 1 else np.concatenate([np.zeros((0, 4), dtype=np.int64), *own])
 
     @property
     def pins(self) -> tuple[Pin, ...]:
@@ -214,9 +227,8 @@ class Scene:
         springs = [np.full(len(p.vertices), np.inf) if p.stiffness is None else p.stiffness for p in self.pins]
         stiffness = np.concatenate([np.zeros(0), *springs])
         stencils = merge_groups(self._stencils(starts))
-        masses = np.concatenate([body.masses() for body in self.bodies])
-        component = _joined(self._components(), stencils)
-        pinned = PinnedComponents.of(positions, masses, component, pin_vertices)
+        component = _joined(self._components, stencils)
+        pinned = PinnedComponents.of(positions, self._masses, component, pin_vertices)
         gravity, damping = self._all(Gravity), self._all(Damping)
         none = np.zeros(0)
         poisson, tet_group = self._poisson()
@@ -225,7 +237,7 @@ class Scene:
             tets=self._tets_of(self.elastic_solids),
             stiffness=np.concatenate([none, *(solid.stiffness for solid in self.elastic_solids)]),
             density=np.concatenate([none, *(solid.filled_density for solid in self.elastic_solids)]),
-            masses=masses,
+            masses=self._masses,
             pin_vertices=pin_vertices,
             pin_stiffness=stiffness,
             pin_targets=positions[pin_vertices],
@@ -252,13 +264,23 @@ class Scene:
                 yield group if group.tets is None else replace(group, tets=group.tets + tets)
             tets += len(part.mesh.tets) if isinstance(part, Solid) and part.plastic is None else 0
 
+    @cached_property
+    def _masses(self) -> Array:
+        """Lumped masses of the vertices of all bodies [V] kg."""
+        masses = np.concatenate([body.masses() for body in self.bodies])
+        masses.setflags(write=False)
+        return masses
+
+    @cached_property
     def _components(self) -> Index:
         """Number of the connected component of each vertex within its body [V]."""
         parts, count = [], 0
         for body in self.bodies:
             parts.append(mesh_components(body.elements) + count)
             count = int(parts[-1].max()) + 1
-        return np.concatenate(parts)
+        components = np.concatenate(parts)
+        components.setflags(write=False)
+        return components
 
     def _poisson(self) -> tuple[Array | None, Index | None]:
         """Poisson's ratios of all tetrahedra and their groups, or None if every solid has the scalar 0."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..common.checks import check_like, check_whole, expand_shared, to_full_precision
+from ..common.memory import chunks
 from ..common.warn import warn_user
 from ..scene.scene import Scene
 from .state import History, HistoryState, State
@@ -58,27 +59,35 @@ def report_resolution(scene: Scene, dtype: torch.dtype) -> None:
     """
     if dtype != torch.float32:
         return
-    found = [_shortest_and_farthest(body.mesh.vertices, body.elements) for body in scene.bodies]
-    shortest, farthest = (np.concatenate(part) for part in zip(*found, strict=True))
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows has no resolution
-        steps = np.nan_to_num(np.spacing(farthest.astype(np.float32)) / shortest, nan=np.inf)
-    worst = int(steps.argmax())
-    if steps[worst] > _COARSEST:
+    coarse = np.concatenate([_coarse_elements(body.mesh.vertices, body.elements) for body in scene.bodies])
+    if len(coarse):
+        step, shortest, farthest = coarse[coarse[:, 0].argmax()]
         element, elements = ("a tet", "tets") if len(scene.solids) == len(scene.bodies) else ("an element", "elements")
+        count = sum(len(body.elements) for body in scene.bodies)
         warn_user(
-            f"Simulator: {farthest[worst]:.4g} m from the origin float32 resolves positions to "
-            f"{steps[worst] * shortest[worst]:.2g} m, {steps[worst]:.2g} of the shortest edge of {element} there "
-            f"({int((steps > _COARSEST).sum())} of {len(steps)} {elements} have more than {_COARSEST:g}), so bodies at "
-            "rest will move. Move the scene to the origin with mesh.translated(...), or pass dtype=torch.float64"
+            f"Simulator: {farthest:.4g} m from the origin float32 resolves positions to {step * shortest:.2g} m, "
+            f"{step:.2g} of the shortest edge of {element} there ({len(coarse)} of {count} {elements} have more than "
+            f"{_COARSEST:g}), so bodies at rest will move. Move the scene to the origin with mesh.translated(...), or "
+            "pass dtype=torch.float64"
         )
 
 
-def _shortest_and_farthest(points: Array, elements: Index) -> tuple[Array, Array]:
-    """Shortest edge of each element [E] m, and its largest coordinate [E] m."""
-    corners = [points[column] for column in elements.T]
-    edges = (one - other for one, other in combinations(corners, 2))
-    shortest = np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges)))
-    return shortest, np.abs(points).max(axis=1)[elements].max(axis=1)
+def _coarse_elements(points: Array, elements: Index) -> Array:
+    """Rows [n, 3] of the elements with a float32 spacing above _COARSEST.
+
+    The spacing in shortest edges, the shortest edge, and the largest coordinate [m].
+    """
+    reach, found = np.abs(points).max(axis=1), []
+    for some in chunks(len(elements)):
+        columns = elements[some].T
+        edges = (one - other for one, other in combinations([points[column] for column in columns], 2))
+        shortest = np.sqrt(reduce(np.minimum, (np.einsum("ij,ij->i", edge, edge) for edge in edges)))
+        farthest = reduce(np.maximum, (reach[column] for column in columns))
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows has no resolution
+            step = np.nan_to_num(np.spacing(farthest.astype(np.float32)) / shortest, nan=np.inf)
+        is_coarse = step > _COARSEST
+        found.append(np.stack([step, shortest, farthest], axis=1)[is_coarse])
+    return np.concatenate(found)
 
 
 def check_positive_number(name: str, value: float, unit: str) -> float:

@@ -80,30 +80,20 @@ class Stepper {
     team_.barrier();
   }
 
-  // Exact minimum of E along the rigid motions of every component that pins and contacts leave free.
+  // The coarse correction: every body that pins leave free takes the rigid motion with the least energy. Before the
+  // iterations a solid one chooses between two iterates: the present shape, and the guess.
   void align() {
     const bool first = !started_;
     started_ = true;
     if (plan_.components == 0 || (first && set_.start() == StartKind::given)) return;
+    if (first && plan_.solid_components > 0) return choose_first_iterate();
     if constexpr (HasContacts) {
-      if (first && team_.rank == 0)
-        begin_still(
-            plan_, w_, contacts_, [&](int i) { return vertex(i); },
-            [&](int i) { return guess(i); });
+      each_elastic_force(
+          [&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force, Wide(1.0)); });
     }
-    bool goes_on = true;
-    for (int leg = 0; goes_on; ++leg) {
-      if (team_.rank == 0)
-        w_.some_go_on = find_motions<HasContacts>(plan_, w_, contacts_, first, leg);
-      team_.barrier();
-      goes_on = w_.some_go_on;
-      for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-        if (plan_.vertex_component[i] < 0) continue;
-        const Vec3<Real> y = Lanes::vec3(w_.x[i] + w_.u[i]);
-        const Vec3<Real> displacement = w_.motion[plan_.vertex_component[i]].of(y);
-        w_.u[i] = vertex(i).displaced(w_.u[i], displacement);
-        if (first) w_.before[i] = w_.u[i];
-      }
+    correct(first);
+    if (first) {
+      each_that_moves([&](std::int64_t i) { w_.before[i] = w_.u[i]; });
       team_.barrier();
     }
   }
@@ -153,6 +143,128 @@ class Stepper {
   }
 
  protected:
+  template <class Visit>
+  void each_that_moves(const Visit& visit) {
+    for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
+      if (plan_.vertex_component[i] >= 0) visit(i);
+    }
+  }
+
+  // visit(vertex, elastic force) for every vertex of a body that moves
+  template <class Visit>
+  void each_elastic_force(const Visit& visit) {
+    sweep_.run(0, elastic_gradient<false>(), [&](std::int64_t i, const Value& force, Sum&) {
+      if (plan_.vertex_component[i] >= 0) visit(i, widened<Wide>(Lanes::vec3(force)));
+    });
+  }
+
+  VertexForces<Lanes> forces_of(std::int64_t i) const { return {w_, plan_.vertices, int(i)}; }
+
+  // Keeps the forces with which the contacts answer the gradient of E; `inertial`: 1, or 0 without inertia.
+  void keep_forces(std::int64_t i, const Vec3<Wide>& elastic, const Wide& inertial) {
+    const CoarseVertex<Wide> v = coarse_vertex(w_, i);
+    const Vec3<Wide> offset = v.u - widened<Wide>(Lanes::vec3(w_.target[i]));
+    const Vec3<Wide> gradient =
+        multiply_add(inertial * Lanes::widen(w_.inertia[i]), offset, elastic);
+    const Vec3<Wide> free = subtract_product(v.u, Lanes::widen(w_.inverse[i]), gradient);
+    pd::keep_forces(contacts_, v, free, forces_of(i));
+  }
+
+  // Moves every body by its rigid motion with the least energy, and then each vertex by what the contacts still push.
+  void correct(bool early) {
+    if (team_.rank == 0) find_motions<HasContacts>(plan_, w_, contacts_, early);
+    team_.barrier();
+    each_that_moves([&](std::int64_t i) {
+      CoarseVertex<Wide> v = coarse_vertex(w_, i);
+      const auto narrowed = [](const Vec3<Wide>& a) {
+        return Vec3<Real>{Lanes::narrow(a.x), Lanes::narrow(a.y), Lanes::narrow(a.z)};
+      };
+      const Vec3<Wide> way = w_.motion[plan_.vertex_component[i]].of(v.x + v.u);
+      Value u = vertex(i).displaced(w_.u[i], narrowed(way));
+      if constexpr (HasContacts) {
+        v.u = widened<Wide>(Lanes::vec3(u));
+        u = vertex(i).displaced(u, narrowed(push_of(contacts_, v, forces_of(i))));
+        u = vertex(i).project(contacts_, u, u);
+      }
+      const Wide moves = w_.body_sums[plan_.vertex_component[i]].moves;
+      w_.u[i] = select(Lanes::narrow(moves) > Real(T(0)), u, w_.u[i]);
+    });
+    team_.barrier();
+  }
+
+  Value present_iterate(std::int64_t i) const { return vertex(i).current_iterate(contacts_); }
+  Value guessed_iterate(std::int64_t i) const {
+    return vertex(i).first_iterate(contacts_, guess(i));
+  }
+
+  // The present shape and the guess are both corrected, and the one with the lower energy stays (rise_of). For the present
+  // shape, contacts answer the elastic forces alone.
+  void choose_first_iterate() {
+    const auto add_work = [&](std::int64_t i, const Vec3<Wide>& force, double side) {
+      const Vec3<Wide> way = widened<Wide>(Lanes::vec3(guessed_iterate(i))) -
+                             widened<Wide>(Lanes::vec3(present_iterate(i)));
+      Wide work = Wide(0.5) * dot(force, way);
+      if constexpr (HasContacts) {
+        keep_forces(i, force, Wide(side > 0 ? 0.0 : 1.0));
+        work = multiply_add(Wide(side),
+                            anchor_energy(contacts_, coarse_vertex(w_, i), forces_of(i)), work);
+      }
+      w_.work[i] = w_.work[i] + Lanes::narrow(work);
+    };
+    each_that_moves([&](std::int64_t i) {
+      w_.u[i] = present_iterate(i);
+      w_.work[i] = Real(T(0));
+    });
+    team_.barrier();
+    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, 1.0); });
+    correct(true);
+    if (team_.rank == 0) {
+      for (int n = 0; n < plan_.components * width; ++n) w_.reached[n] = w_.bodies[n].reached();
+      for (int g = 0; g < plan_.components; ++g) w_.motion_before[g] = w_.motion[g];
+    }
+    each_that_moves([&](std::int64_t i) {
+      w_.before[i] = w_.u[i];
+      w_.u[i] = guessed_iterate(i);
+    });
+    team_.barrier();
+    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, -1.0); });
+    correct(true);
+    if (team_.rank == 0) sum_rises();
+    team_.barrier();
+    each_that_moves([&](std::int64_t i) {
+      const int g = plan_.vertex_component[i];
+      const BodySums<Wide>& body = w_.body_sums[g];
+      const Real none(T(0)),
+          moves = Real(T(g < plan_.solid_components ? 1 : 0)) * Lanes::narrow(body.moves);
+      const auto stays = moves > none && !(Lanes::narrow(body.rise) < none);
+      w_.u[i] = w_.before[i] = select(stays, w_.before[i], w_.u[i]);
+    });
+    team_.barrier();
+  }
+
+  // Of every body, from the present shape to the guess.
+  void sum_rises() {
+    for (int g = 0; g < plan_.components; ++g) {
+      for (int lane = 0; lane < width; ++lane) {
+        const int n = g * width + lane;
+        put_lane<Lanes>(w_.body_sums[g].rise, lane, w_.bodies[n].reached() - w_.reached[n]);
+      }
+    }
+    each_in_a_body<Lanes>(plan_, [&](int i, int g) {
+      const auto candidate = [&](const Value& first, const Value& last,
+                                 const RigidMotion<Wide>& motion) {
+        return Candidate<Wide>{widened<Wide>(Lanes::vec3(first)), widened<Wide>(Lanes::vec3(last)),
+                               motion};
+      };
+      const Candidate<Wide> kept = candidate(present_iterate(i), w_.before[i], w_.motion_before[g]),
+                            moved = candidate(guessed_iterate(i), w_.u[i], w_.motion[g]);
+      Wide& rise = w_.body_sums[g].rise;
+      rise = (rise + Lanes::widen(w_.work[i])) +
+             rise_of<HasContacts>(Lanes::widen(w_.inertia[i]), widened<Wide>(Lanes::vec3(w_.x[i])),
+                                  widened<Wide>(Lanes::vec3(w_.target[i])), kept, moved);
+    });
+  }
+
   Value target(std::int64_t i, const Real& spring, const Value& pin) const {
     const Real h(h_), mass = in_.number(call_.material.masses, plan_.vertex_order[i]);
     const Real weight = inertia_weight(mass, damping_, spring, h);

@@ -3,7 +3,7 @@
 #include "contact/plane_sphere.h"
 #include "cpu/step/element_blocks.h"
 #include "elements/lame.h"
-#include "solver/rigid/rolling_contact.h"
+#include "solver/coarse/newton.h"
 
 #include <cmath>
 #include <cstdint>
@@ -22,15 +22,14 @@ inline Storage allocate_zeroed(std::size_t bytes) {
   return Storage(new (std::align_val_t{64}) std::byte[bytes]());
 }
 
-// sums of a component with free rigid motions, see solver/rigid/free_motion.h
+// sums of a body that moves rigidly, see solver/coarse
 template <class Wide>
-struct ComponentSums {
-  Wide start[StartSums::count];
-  Wide rigid[RigidSums::count];
+struct BodySums {
+  Wide rigid[RigidSums::count], contact[ContactSums::count];
   Vec3<Wide> center;
-  Wide gaps[Touch::planes + 1], touch[Touch::sums], bounds[Touch::bounds];
-  Wide found[Found::count];
-  bool tips, still;  // in some environment
+  Wide moves;    // 1, or 0 where pins clamp it
+  Wide rise;     // of the energy, from the first to the second first iterate
+  bool goes_on;  // in some environment
 };
 
 constexpr int shared_chunk = 256;  // shared vertices that one sum covers
@@ -52,13 +51,15 @@ struct Workspace {
   Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
   Value *origin, *shared_force;                       // [slots]
   Part* parts[2];  // iterations alternate, so that no thread overwrites sums that others read
-  ComponentSums<Wide>* component_sums;  // [components]
-  RigidMotion<Real>* motion;            // [components]
-  Real (*touched)[Touch::planes];  // [components] 1 for each of the first planes that it touches
-  Real* still;                     // [components] 1 if it starts from its current position
-  Tipping* tipping;                // [components, environments]
-  bool* goes_on;                // [components, environments] moves in this leg, then: in the next
-  TippingSearch<Real>* search;  // [components]
+  BodySums<Wide>* body_sums;         // [components]
+  CoarseBody* bodies;                // [components, environments]
+  CoarseTrial<Wide>* trial;          // [components]
+  RigidMotion<Wide>* motion;         // [components]
+  RigidMotion<Wide>* motion_before;  // [components] of the first of both first iterates
+  double* reached;       // [components, environments] Phi of the first of both first iterates
+  Real* work;            // [vertices] of the mean elastic force, from the first to the second
+  Value* contact_force;  // [contacts, vertices], like the next
+  Real* friction_radius;
   Plane<Real>* planes;
   Sphere<Real>* spheres;
   // [elements], or [elements, W] when stiffness differs between environments: w V, where w is Young's modulus, or 2 mu
@@ -67,8 +68,7 @@ struct Workspace {
   T* numbers;  // the same of stencils: [rows of 16 numbers of a step]
   int part_count;
   bool shared_weight, shared_numbers;
-  T per_time;               // 1 / h of the step, or 0 where energies that dissipate do not count
-  bool some_go_on = false;  // some environment moves in the next leg
+  T per_time;  // 1 / h of the step, or 0 where energies that dissipate do not count
 
   explicit Workspace(const StepCall<T>& call)
       : Workspace(call.plan, call.material, call.effects,
@@ -130,14 +130,17 @@ struct Workspace {
     place(origin, plan.slots, base);
     place(shared_force, plan.shared ? plan.slots : 0, base);
     for (Part*& array : parts) place(array, part_count, base);
-    place(component_sums, plan.components, base);
+    place(body_sums, plan.components, base);
+    place(bodies, plan.components * Lanes::environments, base);
     place(motion, plan.components, base);
-    place(touched, plan.components, base);
-    place(still, plan.components, base);
-    const int tipping_components = material.planes_count > 0 ? plan.components : 0;
-    place(tipping, tipping_components * Lanes::environments, base);
-    place(search, tipping_components, base);
-    place(goes_on, plan.components * Lanes::environments, base);
+    place(motion_before, plan.components, base);
+    place(reached, plan.components * Lanes::environments, base);
+    place(work, plan.components > 0 ? plan.vertices : 0, base);
+    const std::int64_t contacts =
+        plan.components > 0 ? material.planes_count + material.spheres_count : 0;
+    place(trial, contacts > 0 ? plan.components : 0, base);
+    place(contact_force, contacts * plan.vertices, base);
+    place(friction_radius, contacts * plan.vertices, base);
     place(planes, material.planes_count, base);
     place(spheres, material.spheres_count, base);
     const std::int64_t weights =

@@ -1,7 +1,6 @@
 // Vertex state in device memory, and the update of one vertex.
 #pragma once
 #include "cuda/common/inputs.h"
-#include "solver/rigid/free_motion.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -72,10 +71,6 @@ struct Vertices {
     const bool given = settings.start() == StartKind::given;
     return at(i).first_iterate(
         contacts, given ? in.first_iterate(vertex) - vec3(x[i]) : predicted(i, settings));
-  }
-
-  PD_DEVICE Vec3<T> moved(int i, const RigidMotion<T>& motion) const {
-    return at(i).displaced(vec3(u[i]), motion.of(vec3(x[i]) + vec3(u[i])));
   }
 
   PD_DEVICE void set(unsigned i, const Vec3<T>& value) const { u[i] = quad(value, u[i].w); }

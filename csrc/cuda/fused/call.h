@@ -23,11 +23,12 @@ template <class T>
 struct FusedScratch {
   Quad<T>* vertex[vertex_arrays];  // [teams, slots]; arrays outside shared memory
   T* weights;                      // [teams, blocks, pair_weights, 32]
-  Piece<T>* pieces;                // [teams, patches, pieces]
-  // [teams, parts, PartSums::count]; a part holds the vertices of a piece that a patch owns
+  Piece* pieces;                   // [teams, patches, pieces]
+  // [teams, count_rows, PartSums::count]
   double* part_sum;
-  TaggedWord* messages;  // grid: [teams, 2, slots, words] forces on shared vertices
-  TaggedWord* sums;      // grid: [teams, 2, patches, sums_count]
+  TaggedWord* messages;     // grid: [teams, 2, slots, words] forces on shared vertices
+  TaggedWord* sums;         // grid: [teams, 2, patches, sums_count]
+  ContactForces<T> forces;  // of the teams
 };
 
 template <class T>

@@ -242,7 +242,8 @@ FusedScratch<T> arrange(Arena& arena, const DeviceStep<T>& step, const Launch& l
   const bool own = launch.kind == Blocks::cluster && near_once(sizeof(T));
   arena.place(s.weights, own ? 0 : teams * plan.blocks * pair_weights * pair_lanes);
   arena.place(s.pieces, teams * launch.patches * plan.pieces);
-  arena.place(s.part_sum, teams * plan.parts * PartSums::count);
+  arena.place(s.part_sum, teams * count_rows(plan) * PartSums::count);
+  s.forces = arrange_contact_forces(arena, step, teams);
   return s;
 }
 

@@ -135,7 +135,7 @@ class FusedRunner {
     __syncthreads();
   }
 
-  // Minimises E exactly over the rigid motions of every piece that pins and contacts leave free.
+  // The coarse correction of every piece that pins leave free.
   PD_DEVICE void align() {
     if constexpr (Clustered) store_iterate();
     apply_last_sums();
@@ -208,6 +208,17 @@ class FusedRunner {
     each_slot([&](int s) { v_.finish(s, h_); });
   }
 
+  // ---- coarse correction, by a copy of the runner: cuda/fused/rigid.h
+
+  // State of the team's exchanges, which the copy advances.
+  struct Exchanges {
+    TeamSums<Kind> sums;
+    unsigned round, waited;
+  };
+
+  PD_DEVICE void correct_pieces(bool first);
+  PD_DEVICE Exchanges exchanges() const { return {sums_, round_, waited_}; }
+
  private:
   // Makes what stencils remember of the start of the step.
   PD_DEVICE void begin_stencils() {
@@ -228,11 +239,11 @@ class FusedRunner {
   PD_DEVICE T* weights() const {
     return memory_.weights + std::int64_t(team_) * plan_.blocks * pair_weights * pair_lanes;
   }
-  PD_DEVICE Piece<T>& piece(int piece) const {
+  PD_DEVICE Piece& piece(int piece) const {
     return memory_.pieces[(std::int64_t(team_) * plan_.patches + index_) * plan_.pieces + piece];
   }
   PD_DEVICE double* part_sums() const {
-    return memory_.part_sum + std::int64_t(team_) * plan_.parts * PartSums::count;
+    return memory_.part_sum + std::int64_t(team_) * count_rows(plan_) * PartSums::count;
   }
   PD_DEVICE TaggedWord* mailbox() const {
     return memory_.messages +
@@ -452,9 +463,22 @@ class FusedRunner {
   PD_DEVICE T compute_own_weight(const T* stiffness, bool bounded);
   PD_DEVICE void load_own();
 
-  // ---- rigid motions: cuda/fused/rigid.h
+  // ---- coarse correction: cuda/fused/rigid.h
 
   PD_DEVICE void align_pieces();
+  // Forgets what a pass sets anew: kept for the copy, it would take registers from the iterations.
+  PD_DEVICE void forget() {
+    energy_ = first_ = second_ = 0;
+    omega_ = next_omega_ = T(1);
+    item_ = {};
+    loaded_ = {};
+    guarding_ = late_ = false;
+  }
+  PD_DEVICE Correction<T, HasContacts> correction(Iterate from) const {
+    return {v_, contacts_, in_, memory_.forces.of_environment(team_), from};
+  }
+  PD_DEVICE void take_present_shape();
+  PD_DEVICE void keep_forces(Iterate from);
 
   // ---- results
 

@@ -19,10 +19,11 @@ struct EnvironmentControl {
 // Device memory of the blocks.
 template <class T>
 struct SmallBatchScratch {
-  Quad<T>*x, *velocity;  // [blocks, per_block, slots]
-  T* weights;            // [blocks, per_block, blocks of pairs, 2, 32] w V
-  Piece<T>* pieces;      // [blocks, per_block, pieces]
-  double* part_sum;      // [blocks, per_block, parts, PartSums::count]
+  Quad<T>*x, *velocity;     // [blocks, per_block, slots]
+  T* weights;               // [blocks, per_block, blocks of pairs, 2, 32] w V
+  Piece* pieces;            // [blocks, per_block, pieces]
+  double* part_sum;         // [blocks, per_block, count_rows, PartSums::count]
+  ContactForces<T> forces;  // [blocks, per_block]
 };
 
 // Step from one item of a thread to its next: whole environments, and the remainder.

@@ -95,7 +95,8 @@ SmallBatchScratch<T> arrange(Arena& arena, const DeviceStep<T>& step,
   arena.place(s.velocity, many * plan.slots);
   arena.place(s.weights, many * plan.blocks * 2 * pair_lanes);
   arena.place(s.pieces, many * plan.pieces);
-  arena.place(s.part_sum, many * plan.parts * PartSums::count);
+  arena.place(s.part_sum, many * count_rows(plan) * PartSums::count);
+  s.forces = arrange_contact_forces(arena, step, many);
   return s;
 }
 

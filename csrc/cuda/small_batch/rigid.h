@@ -1,4 +1,4 @@
-// Members of SmallBatchRunner that move pieces as rigid bodies, see cuda/rigid/rounds.h.
+// Members of SmallBatchRunner for the coarse correction, see cuda/rigid/rounds.h.
 #pragma once
 #include "cuda/rigid/rounds.h"
 #include "cuda/small_batch/runner.h"
@@ -8,70 +8,92 @@ namespace pd::inline PD_TARGET {
 template <class T, bool HasContacts, bool HasFreePieces, bool OnePerThread, bool FewRegisters>
 struct SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread, FewRegisters>::Rounds {
   SmallBatchRunner& r;
+  Iterate from;
 
-  template <Rigid What>
-  PD_DEVICE void find(const Aligning& how) {
+  template <Round What>
+  PD_DEVICE void find() {
     const int warp = int(threadIdx.x) / warp_size, warps = blockDim.x / warp_size;
     for (int n = warp; n < r.here_ * r.plan_.parts; n += warps) {
       const WorkItem item = r.item_of(n, r.plan_.parts);
-      const Part part(r.plan_, item.at, nullptr, item.environment * r.slots());
-      const Piece<T>& piece = r.piece(item.environment, part.piece(r.plan_));
-      sum_part<What>(r.v_, r.contacts(item.environment), r.set_, how, part, piece,
-                     r.part_sums(item.environment) + PartSums::count * item.at);
+      const Part part(r.plan_, item.at, false, item.environment * r.slots());
+      const Piece& piece = r.piece(item.environment, part.piece(r.plan_));
+      sum_part<What>(r.correction(item.environment, from), r.plan_, part, piece,
+                     r.part_sums(item.environment) + PartSums::count * r.plan_.part_row[item.at]);
     }
     __syncthreads();
+    for (int level = 0; level < r.plan_.sum_levels; ++level) {
+      const int first = r.plan_.level_sum[level], sums = r.plan_.level_sum[level + 1] - first;
+      for (int n = warp; n < r.here_ * sums; n += warps) {
+        const WorkItem item = r.item_of(n, sums);
+        sum_rows<What>(r.plan_, first + item.at, r.part_sums(item.environment));
+      }
+      __syncthreads();
+    }
     for (int n = warp; n < r.here_ * r.plan_.pieces; n += warps) {
       const WorkItem item = r.item_of(n, r.plan_.pieces);
-      move_piece<What>(r.plan_, item.at, r.contacts(item.environment), how,
+      move_piece<What>(r.plan_, item.at, HasContacts, from != Iterate::last,
                        r.part_sums(item.environment), r.piece(item.environment, item.at));
     }
     __syncthreads();
   }
 
-  PD_DEVICE void begin_still() {
-    r.each_slot([&](const WorkItem& item, int i) {
-      const int number = r.plan_.slot_piece[item.at];
-      if (number >= 0 && r.piece(item.environment, number).still)
-        r.v_.set(i, r.v_.at(i).current_iterate(r.contacts(item.environment)));
-    });
-    __syncthreads();
-  }
-
-  PD_DEVICE bool some_tip() const {
-    return some_piece([](const Piece<T>& p) { return p.tipping.goes_on(); });
-  }
-
-  PD_DEVICE bool some_go_on(int leg) const {
-    return some_piece([&](const Piece<T>& p) { return p.leg == leg; });
-  }
-
- private:
-  template <class Is>
-  PD_DEVICE bool some_piece(const Is& is) const {
+  PD_DEVICE bool some_search() const {
     return some_of(r.here_ * r.plan_.pieces, [&](int n) {
       const WorkItem item = r.item_of(n, r.plan_.pieces);
-      return is(r.piece(item.environment, item.at));
+      return !r.piece(item.environment, item.at).body.is_done();
     });
   }
 };
 
 template <class T, bool HasContacts, bool HasFreePieces, bool OnePerThread, bool FewRegisters>
 PD_DEVICE void SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread,
-                                FewRegisters>::move_pieces(bool first) {
-  Aligning how(plan_, HasContacts, first);
-  Rounds rounds{*this};
-  do {
-    find_in_rounds<HasContacts>(rounds, how, contacts(0).has_multiple());
-    each_slot([&](const WorkItem& item, int i) {
-      const int number = plan_.slot_piece[item.at];
-      if (number < 0 || !(v_.u[i].w > 0)) return;  // of no free piece, or pinned
-      const Vec3<T> u = v_.moved(i, piece(item.environment, number).motion);
-      move(i, u);
-      if (first) v_.set_before(i, u);
+                                FewRegisters>::correct_pieces(bool first) {
+  prefetch_pair(first_pair_);
+  const bool both = first && plan_.solid_pieces > 0;
+  if (both) {
+    each_slot_of_a_piece([&](const WorkItem& item, int i, const Piece&) {
+      move(i, correction(item.environment, Iterate::present).present(i));
     });
-    __syncthreads();
-    how.go_on();
-  } while (HasContacts && rounds.some_go_on(how.leg));
+  }
+#pragma unroll 1
+  for (int n = both ? 0 : 1; n < 2; ++n) {
+    const Iterate from = iterate_of(n, first);
+    if (HasContacts || first) keep_forces(from);
+    Rounds rounds{*this, from};
+    find_motions<HasContacts>(plan_, rounds);
+    each_slot_of_a_piece([&](const WorkItem& item, int i, const Piece& piece) {
+      move(i, correction(item.environment, from).corrected(i, item.at, piece.body));
+    });
+    if (from != Iterate::guess) continue;
+    rounds.template find<Round::rises>();
+    each_slot_of_a_piece([&](const WorkItem& item, int i, const Piece& piece) {
+      move(i, correction(item.environment, from).chosen(i, piece.body, piece.rise));
+    });
+  }
+}
+
+template <class T, bool HasContacts, bool HasFreePieces, bool OnePerThread, bool FewRegisters>
+template <class Visit>
+PD_DEVICE void SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread,
+                                FewRegisters>::each_slot_of_a_piece(const Visit& visit) {
+  each_slot([&](const WorkItem& item, int i) {
+    const int number = plan_.slot_piece[item.at];
+    // pins hold others
+    if (number >= 0 && v_.u[i].w > 0) visit(item, i, piece(item.environment, number));
+  });
+  __syncthreads();
+}
+
+template <class T, bool HasContacts, bool HasFreePieces, bool OnePerThread, bool FewRegisters>
+PD_DEVICE void SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread,
+                                FewRegisters>::keep_forces(Iterate from) {
+  each_pair<false>(SolidGradient<false>{});
+  __syncthreads();
+  each_slot([&](const WorkItem& item, int i) {
+    if (plan_.slot_piece[item.at] < 0) return;
+    correction(item.environment, from).keep_forces(i, item.at, force_on(item));
+  });
+  __syncthreads();
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -100,7 +100,7 @@ class SmallBatchRunner {
     __syncthreads();
   }
 
-  // Minimises E exactly over the rigid motions of every piece that pins and contacts leave free.
+  // The coarse correction of every piece that pins leave free.
   PD_DEVICE void align() {
     apply_last_sums();
     if constexpr (HasFreePieces) align_pieces();
@@ -137,12 +137,16 @@ class SmallBatchRunner {
     return memory_.weights +
            (first_of_block_ + environment) * unsigned(2 * pair_lanes * plan_.blocks);
   }
-  PD_DEVICE Piece<T>& piece(int environment, int piece) const {
+  PD_DEVICE Piece& piece(int environment, int piece) const {
     return memory_.pieces[std::int64_t(first_of_block_ + environment) * plan_.pieces + piece];
   }
   PD_DEVICE double* part_sums(int environment) const {
     return memory_.part_sum +
-           std::int64_t(first_of_block_ + environment) * plan_.parts * PartSums::count;
+           std::int64_t(first_of_block_ + environment) * count_rows(plan_) * PartSums::count;
+  }
+  PD_DEVICE Correction<T, HasContacts> correction(int environment, Iterate from) const {
+    return {v_, contacts(environment), inputs(environment),
+            memory_.forces.of_environment(first_of_block_ + environment), from};
   }
 
   // ---- assignment of work
@@ -358,7 +362,7 @@ class SmallBatchRunner {
     prefetch_pair(first_pair_);
   }
 
-  // ---- rigid motions: cuda/small_batch/rigid.h
+  // ---- coarse correction: cuda/small_batch/rigid.h
 
   struct Rounds;
 
@@ -379,10 +383,13 @@ class SmallBatchRunner {
     SmallBatchRunner run(call, shared);
     run.first_ = first_environment;
     run.here_ = here;
-    run.move_pieces(first);
+    run.correct_pieces(first);
   }
 
-  PD_DEVICE void move_pieces(bool first);
+  PD_DEVICE void correct_pieces(bool first);
+  PD_DEVICE void keep_forces(Iterate from);
+  template <class Visit>
+  PD_DEVICE void each_slot_of_a_piece(const Visit& visit);
 
   // ---- results
 

@@ -23,17 +23,18 @@ template <class T>
 struct StreamMemory {
   Quad<T>*x, *velocity, *target, *u, *before;  // [batch, vertices]
   Quad<T>* origin;                             // [batch, slots]
-  Quad<T>* shared_force;  // [batch, places]; halo messages in float32 (cuda/common/reductions.h)
-  T* weights;             // [batch or 1, blocks, pair_weights, 32]
-  T* patch_weight;        // [batch or 1, patches]; -1 unless the patch has one positive stiffness
-  double* sums;           // [batch, patches + blocks of shared vertices, sums_count]
-  Progress* progress;     // [batch]
-  double* omega;          // [batch, guard_period] of the next iterations
-  Piece<T>* pieces;       // [batch, pieces]
-  double* part_sum;       // [batch, parts, PartSums::count]
-  unsigned* counter;      // [batch] barrier counters of the teams that move pieces
-  Plane<T>* planes;       // [batch, planes]
-  Sphere<T>* spheres;     // [batch, spheres]
+  Quad<T>* shared_force;    // [batch, places]; halo messages in float32 (cuda/common/reductions.h)
+  T* weights;               // [batch or 1, blocks, pair_weights, 32]
+  T* patch_weight;          // [batch or 1, patches]; -1 unless the patch has one positive stiffness
+  double* sums;             // [batch, patches + blocks of shared vertices, sums_count]
+  Progress* progress;       // [batch]
+  double* omega;            // [batch, guard_period] of the next iterations
+  Piece* pieces;            // [batch, pieces]
+  double* part_sum;         // [batch, count_rows, PartSums::count]
+  unsigned* counter;        // [batch] barrier counters of the teams that move pieces
+  ContactForces<T> forces;  // [batch]
+  Plane<T>* planes;         // [batch, planes]
+  Sphere<T>* spheres;       // [batch, spheres]
 };
 
 template <class T>
@@ -109,11 +110,14 @@ struct StreamWork {
   PD_DEVICE double* sum_row(int row) const {
     return call.memory.sums + (environment * call.sum_rows() + row) * sums_count;
   }
-  PD_DEVICE Piece<T>& piece(int piece) const {
+  PD_DEVICE Piece& piece(int piece) const {
     return call.memory.pieces[environment * plan.pieces + piece];
   }
   PD_DEVICE double* part_sums() const {
-    return call.memory.part_sum + environment * plan.parts * PartSums::count;
+    return call.memory.part_sum + environment * count_rows(plan) * PartSums::count;
+  }
+  PD_DEVICE Correction<T, HasContacts> correction(Iterate from) const {
+    return {v, contacts, in, call.memory.forces.of_environment(environment), from};
   }
 };
 
@@ -121,8 +125,8 @@ struct StreamWork {
 // tolerance they do not, since environments stop at different iterations.
 PD_HD bool alternates(const Settings& settings) { return !(settings.tolerance > 0); }
 
-// The update of a vertex once its elastic force is known.
-enum class Visit { diagonal, update, update_guarded };
+// The update of a vertex once its elastic force is known. keep_forces: see Correction.
+enum class Visit { diagonal, update, update_guarded, keep_forces };
 
 template <Visit What>
 struct ElementOf {
@@ -153,10 +157,13 @@ PD_DEVICE double omega_of_pass(const StreamWork<T, HasContacts>& w, int k) {
 template <Visit What, class T, bool HasContacts>
 PD_DEVICE void visit(const StreamWork<T, HasContacts>& w, unsigned i,
                      const typename Vertices<T, HasContacts>::LoadedVertex& loaded,
-                     const Vec3<T>& force, T omega, ThreadSums& sums) {
+                     const Vec3<T>& force, T omega, ThreadSums& sums,
+                     Iterate from = Iterate::last) {
   double (&sum)[sums_count] = sums.value;
   if constexpr (What == Visit::diagonal) {
     sum[0] = Min{}(sum[0], w.v.set_diagonal(i, force.x));
+  } else if constexpr (What == Visit::keep_forces) {
+    w.correction(from).keep_forces(int(i), int(i), force);
   } else {
     if constexpr (What == Visit::update_guarded) sum[0] += loaded.energy();
     if (!alternates(w.settings())) sum[2] += loaded.square_of_displacement();
@@ -200,6 +207,7 @@ PD_DEVICE void write_sums(const ThreadSums& sums, double* row) {
 
 template <Visit What, class T, bool HasContacts>
 PD_DEVICE bool wants_sums(const StreamWork<T, HasContacts>& w) {
+  if constexpr (What == Visit::keep_forces) return false;
   return What != Visit::update || w.settings().tolerance > 0;
 }
 
@@ -284,7 +292,8 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   return energy;
 }
 
-// Updates the elements and interior vertices of one patch per block.
+// Updates the elements and interior vertices of one patch per block. `k`: iteration, or Iterate for
+// keep_forces.
 template <Visit What, class T, bool HasContacts, class Stencils>
 PD_DEVICE void update_patch(const StreamCall<T>& call, int k, std::byte* shared,
                             const Stencils& stencils) {
@@ -308,7 +317,7 @@ PD_DEVICE void update_patch(const StreamCall<T>& call, int k, std::byte* shared,
       w, number, shared, typename ElementOf<What>::type{}, stencils,
       [&](int i) { return load_vertex<What>(w, i); },
       [&](int i, const auto& loaded, const Vec3<T>& force) {
-        visit<What>(w, i, loaded, force, T(omega), sums);
+        visit<What>(w, i, loaded, force, T(omega), sums, Iterate(k));
       });
   if constexpr (What != Visit::diagonal) sums.value[0] += energy;
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));

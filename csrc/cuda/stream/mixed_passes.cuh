@@ -39,6 +39,8 @@ void (*mixed_pass(Visit what))(MixedStreamCall<T>, int) {
       return mixed_patches<Visit::diagonal, T, HasContacts>;
     case Visit::update:
       return mixed_patches<Visit::update, T, HasContacts>;
+    case Visit::keep_forces:
+      return mixed_patches<Visit::keep_forces, T, HasContacts>;
     default:
       return mixed_patches<Visit::update_guarded, T, HasContacts>;
   }
@@ -46,7 +48,8 @@ void (*mixed_pass(Visit what))(MixedStreamCall<T>, int) {
 
 template <class T, bool HasContacts>
 void allow_mixed_passes(std::size_t bytes) {
-  for (const Visit what : {Visit::diagonal, Visit::update, Visit::update_guarded}) {
+  for (const Visit what :
+       {Visit::diagonal, Visit::update, Visit::update_guarded, Visit::keep_forces}) {
     const auto* kernel = reinterpret_cast<const void*>(mixed_pass<T, HasContacts>(what));
     if (resident_blocks(kernel, pass_threads, bytes) == 0) refuse_shared_memory(bytes);
   }

@@ -1,5 +1,5 @@
-// The rigid motions of cuda/rigid/rounds.h for kernel `stream`, in one launch; a team of blocks works on
-// one environment at a time.
+// The rounds of cuda/rigid/rounds.h for kernel `stream`, in one launch; a team of blocks works on one
+// environment at a time.
 #pragma once
 #include "cuda/common/block_team.h"
 #include "cuda/stream/kernels.h"
@@ -11,7 +11,7 @@ constexpr int rounds_threads = 128;
 template <class T>
 struct RoundsCall {
   StreamCall<T> stream;
-  Aligning how;
+  Iterate from;
   int teams, blocks;  // blocks of a team
   unsigned* counter;  // [teams], zero at the launch
 };
@@ -21,67 +21,62 @@ struct RoundsCall {
 template <class T, bool HasContacts>
 class StreamRounds {
  public:
-  PD_DEVICE StreamRounds(const StreamWork<T, HasContacts>& w, BlockTeam& team)
-      : w_(w), team_(team) {}
+  PD_DEVICE StreamRounds(const StreamWork<T, HasContacts>& w, Iterate from, BlockTeam& team)
+      : w_(w), of_(w.correction(from)), team_(team) {}
 
-  PD_DEVICE void run(Aligning how) {
-    do {
-      find_in_rounds<HasContacts>(*this, how, w_.contacts.has_multiple());
-      each_vertex([&](int i, const Piece<T>& piece) {
-        if (!(w_.v.u[i].w > 0)) return;  // pinned
-        const Vec3<T> u = w_.v.moved(i, piece.motion);
-        w_.v.set(i, u);
-        if (how.first) w_.v.set_before(i, u);
-      });
-      how.go_on();
-    } while (HasContacts && some_piece([&](const Piece<T>& p) { return p.leg == how.leg; }));
+  PD_DEVICE void run() {
+    find_motions<HasContacts>(w_.plan, *this);
+    each_vertex([&](int i, const Piece& piece) { w_.v.set(i, of_.corrected(i, i, piece.body)); });
+    if (of_.from == Iterate::guess) {
+      find<Round::rises>();
+      each_vertex(
+          [&](int i, const Piece& piece) { w_.v.set(i, of_.chosen(i, piece.body, piece.rise)); });
+    }
     team_.barrier();  // blocks start an environment together
   }
 
-  template <Rigid What>
-  PD_DEVICE void find(const Aligning& how) {
+  template <Round What>
+  PD_DEVICE void find() {
     each_part([&](const Part& part, int n) {
-      sum_part<What>(w_.v, w_.contacts, w_.settings(), how, part, w_.piece(part.piece(w_.plan)),
-                     w_.part_sums() + PartSums::count * n);
+      sum_part<What>(of_, w_.plan, part, w_.piece(part.piece(w_.plan)),
+                     w_.part_sums() + std::int64_t(w_.plan.part_row[n]) * PartSums::count);
     });
     team_.barrier();
+    for (int level = 0; level < w_.plan.sum_levels; ++level) {
+      const int first = w_.plan.level_sum[level] + team_.warp();
+      for (int n = first; n < w_.plan.level_sum[level + 1]; n += team_.warps())
+        sum_rows<What>(w_.plan, n, w_.part_sums());
+      team_.barrier();
+    }
     for (int n = team_.warp(); n < w_.plan.pieces; n += team_.warps())
-      move_piece<What>(w_.plan, n, w_.contacts, how, w_.part_sums(), w_.piece(n));
+      move_piece<What>(w_.plan, n, HasContacts, of_.is_early(), w_.part_sums(), w_.piece(n));
     team_.barrier();
   }
 
-  PD_DEVICE void begin_still() {
-    each_vertex([&](int i, const Piece<T>& piece) {
-      if (piece.still) w_.v.set(i, w_.v.at(i).current_iterate(w_.contacts));
-    });
-  }
-
-  PD_DEVICE bool some_tip() const {
-    return some_piece([](const Piece<T>& p) { return p.tipping.goes_on(); });
+  // The same in every block of the team: pieces change only after the next team barrier.
+  PD_DEVICE bool some_search() const {
+    return some_of(w_.plan.pieces, [&](int n) { return !w_.piece(n).body.is_done(); });
   }
 
  private:
-  // The same in every block of the team: pieces change only after the next team barrier.
-  template <class Is>
-  PD_DEVICE bool some_piece(const Is& is) const {
-    return some_of(w_.plan.pieces, [&](int n) { return is(w_.piece(n)); });
-  }
-
   template <class Visit>
   PD_DEVICE void each_part(const Visit& visit) const {
     for (int n = team_.warp(); n < w_.plan.parts; n += team_.warps())
-      visit(Part(w_.plan, n, w_.plan.slot_vertex, 0), n);
+      visit(Part(w_.plan, n, true, 0), n);
   }
 
   template <class Visit>
   PD_DEVICE void each_vertex(const Visit& visit) const {
     each_part([&](const Part& part, int) {
-      const Piece<T>& piece = w_.piece(part.piece(w_.plan));
-      part.each([&](int i) { visit(i, piece); });
+      const Piece& piece = w_.piece(part.piece(w_.plan));
+      part.each([&](int i, int) {
+        if (w_.v.u[i].w > 0) visit(i, piece);  // pins hold others
+      });
     });
   }
 
   const StreamWork<T, HasContacts>& w_;
+  const Correction<T, HasContacts> of_;
   BlockTeam& team_;
 };
 
@@ -92,8 +87,21 @@ __global__ void __launch_bounds__(rounds_threads)
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.counter + number);
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
     const StreamWork<T, HasContacts> w(call.stream, e);
-    StreamRounds<T, HasContacts>(w, team).run(call.how);
+    StreamRounds<T, HasContacts>(w, call.from, team).run();
   }
+}
+
+// Moves the vertices of pieces to the present shape, one warp per part.
+template <class T, bool HasContacts>
+__global__ void __launch_bounds__(rounds_threads)
+    stream_present(const __grid_constant__ StreamCall<T> call) {
+  const std::int64_t number = thread_number() / warp_size, parts = call.step.plan.parts;
+  if (number >= call.step.batch * parts) return;
+  const StreamWork<T, HasContacts> w(call, number / parts);
+  const auto present = w.correction(Iterate::present);
+  Part(w.plan, int(number % parts), true, 0).each([&](int i, int) {
+    w.v.set(i, present.present(i));
+  });
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -42,8 +42,9 @@ StreamMemory<T> arrange(Arena& arena, const StreamCall<T>& call) {
   arena.place(m.progress, step.batch);
   arena.place(m.omega, step.batch * guard_period);
   arena.place(m.pieces, step.batch * plan.pieces);
-  arena.place(m.part_sum, step.batch * plan.parts * PartSums::count);
+  arena.place(m.part_sum, step.batch * count_rows(plan) * PartSums::count);
   arena.place(m.counter, plan.pieces > 0 ? step.batch : 0);
+  m.forces = arrange_contact_forces(arena, step, step.batch);
   arena.place(m.planes, step.batch * material.planes_count);
   arena.place(m.spheres, step.batch * material.spheres_count);
   return m;
@@ -138,9 +139,14 @@ class StreamRunner {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
-    RoundsCall<T> call = {call_, Aligning(plan_, HasContacts, first), teams_.count, teams_.blocks,
-                          call_.memory.counter};
-    launch_teams(rounds_kernel(), call, call.counter, rounds_threads, 0, stream_);
+    if (!first) return correct(Iterate::last);
+    if (plan_.solid_pieces == 0) return correct(Iterate::guess);
+    constexpr int per_block = rounds_threads / warp_size;
+    const std::int64_t parts = call_.step.batch * plan_.parts;
+    launcher_.run(stream_present<T, HasContacts>, (parts + per_block - 1) / per_block,
+                  rounds_threads, 0, call_);
+    correct(Iterate::present);
+    correct(Iterate::guess);
   }
 
   void iterate(int k) {
@@ -229,6 +235,12 @@ class StreamRunner {
     return false;
   }
 
+  void correct(Iterate from) {
+    if (HasContacts || from != Iterate::last) pass<Visit::keep_forces>(int(from));
+    RoundsCall<T> call = {call_, from, teams_.count, teams_.blocks, call_.memory.counter};
+    launch_teams(rounds_kernel(), call, call.counter, rounds_threads, 0, stream_);
+  }
+
   template <Decision What>
   void decide(int k) {
     // one thread per row of sums
@@ -265,7 +277,7 @@ class StreamRunner {
   const StencilWork<T>* stencils_;
   cudaStream_t stream_;
   Launcher launcher_;
-  Teams teams_;           // for rigid motions
+  Teams teams_;           // for the coarse correction
   std::int64_t patches_;  // of all environments
   std::size_t pass_shared_;
   bool started_ = false;
@@ -282,12 +294,14 @@ std::int64_t stream_bytes(const DeviceStep<T>& step) {
 // Raises the shared memory limit of the pass kernels above the default of 48 KB.
 template <class T, bool HasContacts>
 void allow_shared_memory(std::size_t bytes) {
-  for (const auto kernel : {stream_patches<Visit::diagonal, T, HasContacts>,
-                            stream_patches<Visit::update, T, HasContacts>,
-                            stream_patches<Visit::update_guarded, T, HasContacts>}) {
+  const auto allow = [&](void (*kernel)(StreamCall<T>, int)) {
     if (resident_blocks(reinterpret_cast<const void*>(kernel), pass_threads, bytes) == 0)
       refuse_shared_memory(bytes);
-  }
+  };
+  allow(stream_patches<Visit::diagonal, T, HasContacts>);
+  allow(stream_patches<Visit::update, T, HasContacts>);
+  allow(stream_patches<Visit::update_guarded, T, HasContacts>);
+  allow(stream_patches<Visit::keep_forces, T, HasContacts>);
 }
 
 template <class T, bool HasContacts>

@@ -95,8 +95,8 @@ PD_DEVICE typename Vertices<T, HasContacts>::LoadedVertex load_vertex_from_l2(
   return {{vec3(w.v.x[i]), vec3(target), target.w, u.w}, vec3(u), vec3(before)};
 }
 
-// Updates vertices that patches share. With 32 registers per thread, occupancy is highest, which
-// hides the memory latency.
+// Updates vertices that patches share. With 32 registers per thread, occupancy of iterations is
+// highest, which hides the memory latency.
 //
 // With `round` above 0 the kernel runs beside the pipeline of its pass, which leaves registers for
 // one block on each multiprocessor. It updates a vertex as soon as its messages have arrived. Its
@@ -104,7 +104,9 @@ PD_DEVICE typename Vertices<T, HasContacts>::LoadedVertex load_vertex_from_l2(
 // results before it ends. Its last block waits for the pipeline, so waiting for this kernel is
 // waiting for both.
 template <Visit What, class T, bool HasContacts>
-__global__ void __launch_bounds__(shared_threads, sizeof(T) == 4 && !HasContacts ? 16 : 1)
+__global__ void __launch_bounds__(shared_threads,
+                                  sizeof(T) == 4 && !HasContacts && What != Visit::keep_forces ? 16
+                                                                                               : 1)
     stream_shared(const __grid_constant__ StreamCall<T> call, int k, unsigned round) {
   const int blocks = call.shared_blocks(), number = int(blockIdx.x % blocks);
   const StreamWork<T, HasContacts> w(call, blockIdx.x / blocks);
@@ -125,7 +127,7 @@ __global__ void __launch_bounds__(shared_threads, sizeof(T) == 4 && !HasContacts
   const double omega = omega_of_pass<What>(w, k);
   const Vec3<T> force = wait_for_force(w, places, round);
   ThreadSums sums = no_sums<What>();
-  if (i < w.plan.shared) visit<What>(w, vertex, loaded, force, T(omega), sums);
+  if (i < w.plan.shared) visit<What>(w, vertex, loaded, force, T(omega), sums, Iterate(k));
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(w.plan.patches + number));
 }
 

@@ -25,22 +25,23 @@ Candidate candidate_of(const std::vector<Pair>& pairs, std::size_t number) {
 // A phase of eight lanes, being filled.
 class Phase {
  public:
-  // 1 if one more lane with this corner in this bank costs a pass, else 0
-  int cost(int corner, int bank) const { return longest_[corner][bank]; }
+  // bit c: whether one more lane with corner c in this bank costs a pass
+  unsigned costs(int bank) const { return costs_[bank]; }
 
   void add(const Pair& pair) {
     for (int c = 0; c < 5; ++c) {
       const int bank = pair.corner[c] % banks, passes = ++lanes_[c][bank];
       if (passes < passes_[c]) continue;
-      if (passes > passes_[c]) longest_[c] = {};
+      if (passes > passes_[c]) {
+        for (std::uint8_t& costs : costs_) costs &= std::uint8_t(~(1u << c));
+      }
       passes_[c] = passes;
-      longest_[c][bank] = 1;
+      costs_[bank] |= std::uint8_t(1u << c);
     }
   }
 
  private:
-  std::array<std::array<std::uint8_t, banks>, 5> longest_ =
-      {};  // 1: takes most passes of the corner
+  std::array<std::uint8_t, banks> costs_ = {};
   int lanes_[5][banks] = {}, passes_[5] = {};
 };
 
@@ -53,20 +54,31 @@ struct PairOrder {
   bool exchanged = false;
 };
 
+// The cheapest permutation for all costs of a face: bits 3 v + c for its vertex v as corner c.
+constexpr auto face_orders = [] {
+  std::array<PairOrder, 512> best;
+  for (unsigned costs = 0; costs < best.size(); ++costs) {
+    for (int t = 0; t < int(permutations.size()); ++t) {
+      int cost = 0;
+      for (int c = 0; c < 3; ++c) cost += int(costs >> (3 * permutations[t][c] + c) & 1);
+      if (cost < best[costs].cost) best[costs] = {cost, t, false};
+    }
+  }
+  return best;
+}();
+
 // The cheapest order, if it costs less than `limit`.
 PairOrder best_order(const Phase& phase, const Candidate& candidate, int limit) {
   const auto& bank = candidate.bank;
-  const int kept = phase.cost(3, bank[3]) + phase.cost(4, bank[4]);
-  const int exchanged = candidate.single ? never : phase.cost(3, bank[4]) + phase.cost(4, bank[3]);
-  const int apexes = std::min(kept, exchanged);
-  PairOrder best = {limit, 0, false};
-  for (int t = 0; t < int(permutations.size()) && best.cost > apexes; ++t) {
-    const auto& permutation = permutations[t];
-    const int cost = apexes + phase.cost(0, bank[permutation[0]]) +
-                     phase.cost(1, bank[permutation[1]]) + phase.cost(2, bank[permutation[2]]);
-    if (cost < best.cost) best = {cost, t, exchanged < kept};
-  }
-  return best;
+  const auto apex = [&](int place, int corner) {
+    return int(phase.costs(bank[place]) >> corner & 1);
+  };
+  const int kept = apex(3, 3) + apex(4, 4);
+  const int exchanged = candidate.single ? never : apex(4, 3) + apex(3, 4);
+  const auto face = [&](int place) { return phase.costs(bank[place]) & 7; };
+  const PairOrder& order = face_orders[face(0) | face(1) << 3 | face(2) << 6];
+  const int cost = std::min(kept, exchanged) + order.cost;
+  return cost < limit ? PairOrder{cost, order.permutation, exchanged < kept} : PairOrder{limit};
 }
 
 Pair reordered(const Pair& pair, const PairOrder& order) {
@@ -158,25 +170,29 @@ std::int32_t EntryChoice::take(int corner, int lane, std::int32_t slot) {
   std::array<std::int32_t, quarters>& row = row_[slot];
   if (!spread_) return first_[slot] + entry_slice * row[0]++;
   if (lane == 0 && corner == 0) written_ = {};
-  auto& half = written_[corner].half[lane / 16];
-  auto& warp = written_[corner].warp;
+  Written& written = written_[corner];
+  auto& half = written.half[lane / 16];
+  auto& most_half = written.most_half[lane / 16];
   const auto entry_in = [&](int q) { return first_[slot] + entry_slice * row[q]; };
-  const int most_half = *std::max_element(half.begin(), half.end());
-  const int most_warp = *std::max_element(warp.begin(), warp.end());
   // additional passes, then conflicting lanes, then the rows that are left
   const auto cost = [&](int q) {
-    const int e = entry_in(q), met_half = half[e % 16], met_warp = warp[e % 32];
-    return std::array<int, 3>{(met_half == most_half) + (met_warp == most_warp),
-                              met_half + met_warp, row[q] - forces_[slot]};
+    const int e = entry_in(q), met_half = half[e % 16], met_warp = written.warp[e % 32];
+    const int passes = (met_half == most_half) + (met_warp == written.most_warp);
+    return std::int64_t(passes) << 48 | std::int64_t(met_half + met_warp) << 32 | row[q];
   };
   int best = -1;
+  std::int64_t least = 0;
   for (int q = 0; q < quarters; ++q) {
-    if (row[q] < forces_[slot] && (best < 0 || cost(q) < cost(best))) best = q;
+    if (row[q] >= forces_[slot]) continue;
+    const std::int64_t own = cost(q);
+    if (best >= 0 && own >= least) continue;
+    best = q;
+    least = own;
   }
   const std::int32_t entry = entry_in(best);
   row[best] += quarters;
-  ++half[entry % 16];
-  ++warp[entry % 32];
+  most_half = std::max(most_half, ++half[entry % 16]);
+  written.most_warp = std::max(written.most_warp, ++written.warp[entry % 32]);
   return entry;
 }
 

@@ -51,10 +51,12 @@ class EntryChoice {
   bool spread_;
   // for every slot, the next free row for each remainder by four; without `spread` the first counts all
   std::vector<std::array<std::int32_t, quarters>> row_;
-  // lanes of the block that have written to each bank
+  // lanes of the block that have written to each bank, and the most of them
   struct Written {
     std::array<std::array<std::uint8_t, 16>, 2> half;
     std::array<std::uint8_t, 32> warp;
+    std::array<std::uint8_t, 2> most_half;
+    std::uint8_t most_warp;
   };
   std::array<Written, 5> written_ = {};
 };

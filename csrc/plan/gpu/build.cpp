@@ -22,7 +22,7 @@ namespace pd {
 
 namespace {
 
-constexpr int small_part = 64;  // vertices
+constexpr int most_children = 32;  // of a sum over a piece: lanes of a warp
 
 // Computes the offsets of each patch's arrays.
 void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches, int members,
@@ -58,20 +58,27 @@ std::int32_t packed(std::int64_t low, std::int64_t high) {
   return std::int32_t(std::uint32_t(low) | std::uint32_t(high) << 16);
 }
 
-// Writes rest shapes and bounds of a pair in lane `lane` of `block`.
+// The tetrahedra of a block of pairs: the first of each pair, then the second.
+struct BlockTets {
+  std::array<RestShape, 2 * lanes> shape;
+  std::array<bool, 2 * lanes> traceless;
+};
+
+// Writes rest shapes of a pair in lane `lane` of `block`.
 void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, const Pair& pair,
-               double unit, std::int64_t block, std::int64_t lane) {
+               double unit, std::int64_t block, std::int64_t lane, BlockTets& tets) {
   std::array<std::int64_t, 5> vertex;
   for (int c = 0; c < 5; ++c) vertex[c] = patch.vertex[pair.corner[c]];
   double volume[2];
   for (int which = 0; which < 2; ++which) {
-    const Rest rest =
-        rest_of(mesh.elements.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
-    const bool traceless =
+    const std::int64_t place = which * lanes + lane;
+    const RestShape rest =
+        rest_shape(mesh.elements.positions, {vertex[0], vertex[1], vertex[2], vertex[3 + which]});
+    tets.shape[place] = rest;
+    tets.traceless[place] =
         pair.tet[which] >= 0 && !mesh.elements.averaged.has_trace(pair.tet[which]);
-    plan.pair_bound[(2 * block + which) * lanes + lane] = traceless ? -rest.bound : rest.bound;
     if (!plan.pair_factor.empty())
-      plan.pair_factor[(2 * block + which) * lanes + lane] = unit * unit / (6 * rest.volume);
+      plan.pair_factor[2 * block * lanes + place] = unit * unit / (6 * rest.volume);
     volume[which] = pair.tet[which] < 0 ? 0 : std::abs(rest.volume);
   }
   if (plan.pair_rest.empty()) return;
@@ -84,10 +91,22 @@ void fill_rest(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, c
   }
 }
 
+void fill_bounds(DeviceMeshPlan& plan, std::int64_t block, const BlockTets& tets) {
+  for (std::size_t first = 0; first < tets.shape.size(); first += bound_lanes) {
+    std::array<RestShape, bound_lanes> shapes;
+    std::copy_n(tets.shape.begin() + first, bound_lanes, shapes.begin());
+    const std::array<double, bound_lanes> bounds = tet_bounds(shapes);
+    for (std::size_t i = 0; i < bound_lanes; ++i)
+      plan.pair_bound[2 * block * lanes + first + i] =
+          tets.traceless[first + i] ? -bounds[i] : bounds[i];
+  }
+}
+
 void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch, int number,
                  double unit, EntryChoice& choice) {
   const std::int64_t first_block = plan.patch_block[number];
   const std::int64_t count = std::ssize(patch.pairs);
+  BlockTets tets;
   for (std::int64_t i = 0; i < patch.blocks() * lanes; ++i) {
     const std::int64_t block = first_block + i / lanes, lane = i % lanes;
     Pair pair = patch.pairs[std::min(i, count - 1)];
@@ -96,7 +115,8 @@ void fill_blocks(DeviceMeshPlan& plan, const Mesh& mesh, const MeshPatch& patch,
       pair.tet = {-1, -1};
       forces = 0;
     }
-    fill_rest(plan, mesh, patch, pair, unit, block, lane);
+    fill_rest(plan, mesh, patch, pair, unit, block, lane, tets);
+    if (lane == lanes - 1) fill_bounds(plan, block, tets);
     if (!plan.pair_coupled.empty()) plan.pair_coupled[block * lanes + lane] = i < patch.coupled;
     for (int which = 0; which < 2; ++which) {
       const std::int32_t tet = pair.tet[which];
@@ -214,11 +234,10 @@ void place_forces(DeviceMeshPlan& plan) {
   }
 }
 
-// Lists the vertices of each free piece, patch by patch, in parts of at most `most` vertices. Every
+// Lists the vertices of each free piece, patch by patch, in parts that each lane of a warp has at most one vertex of. Every
 // vertex belongs to the first patch that holds it.
-void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pieces, int most) {
+std::vector<std::int32_t> add_parts(DeviceMeshPlan& plan, const std::int32_t* piece) {
   plan.patch_part = plan.part_start = {0};
-  plan.piece_start.assign(pieces + 1, 0);
   std::vector<std::int32_t> part_piece;
   std::vector<std::pair<std::int32_t, std::int32_t>> mine;  // piece, slot
   for (std::size_t p = 0; p + 1 < plan.patch_slot.size(); ++p) {
@@ -232,18 +251,45 @@ void add_parts(DeviceMeshPlan& plan, const std::int32_t* piece, std::int32_t pie
     for (std::size_t i = 0; i < mine.size(); ++i) {
       plan.part_slot.push_back(mine[i].second);
       const std::int32_t size = std::int32_t(plan.part_slot.size()) - plan.part_start.back();
-      if (i + 1 < mine.size() && mine[i + 1].first == mine[i].first && size < most) continue;
+      if (i + 1 < mine.size() && mine[i + 1].first == mine[i].first && size < most_children)
+        continue;
       plan.part_start.push_back(std::int32_t(plan.part_slot.size()));
       part_piece.push_back(mine[i].first);
     }
     plan.patch_part.push_back(std::int32_t(part_piece.size()));
   }
-  for (const std::int32_t number : part_piece) ++plan.piece_start[number + 1];
-  std::partial_sum(plan.piece_start.begin(), plan.piece_start.end(), plan.piece_start.begin());
-  std::vector<std::int32_t> next(plan.piece_start.begin(), plan.piece_start.end() - 1);
-  plan.piece_part.resize(part_piece.size());
-  for (std::size_t part = 0; part < part_piece.size(); ++part)
-    plan.piece_part[next[part_piece[part]]++] = std::int32_t(part);
+  return part_piece;
+}
+
+// The tree of sums over the parts of each piece: rows of parts, piece by piece in patch order, then those of sums of at most
+// 32 rows, level by level.
+void add_sums(DeviceMeshPlan& plan, const std::vector<std::int32_t>& part_piece,
+              std::int32_t pieces) {
+  std::vector<std::int32_t> start(pieces + 1, 0);
+  for (const std::int32_t number : part_piece) ++start[number + 1];
+  std::partial_sum(start.begin(), start.end(), start.begin());
+  std::vector<std::int32_t> begin(start.begin(), start.end() - 1), next = begin,
+                            end(start.begin() + 1, start.end());
+  for (const std::int32_t number : part_piece) plan.part_row.push_back(next[number]++);
+  const auto is_wide = [&](std::int32_t p) { return end[p] - begin[p] > most_children; };
+  std::int32_t rows = std::int32_t(part_piece.size());
+  plan.level_sum = {0};
+  for (bool wide = true; wide;) {
+    wide = false;
+    for (std::int32_t p = 0; p < pieces; ++p) {
+      if (!is_wide(p)) continue;
+      const std::int32_t first = rows;
+      for (std::int32_t child = begin[p]; child < end[p]; child += most_children, ++rows)
+        plan.sum_rows.insert(plan.sum_rows.end(),
+                             {child, std::min(child + most_children, end[p])});
+      begin[p] = first;
+      end[p] = rows;
+      wide = true;
+    }
+    if (wide) plan.level_sum.push_back(std::int32_t(plan.sum_rows.size() / 2));
+  }
+  for (std::int32_t p = 0; p < pieces; ++p)
+    plan.piece_rows.insert(plan.piece_rows.end(), {begin[p], end[p]});
 }
 
 // Replaces groups by their tetrahedra, which count before the stencils.
@@ -278,7 +324,9 @@ std::vector<std::int32_t> count_sizes(const DeviceMeshPlan& plan,
   sizes[size_patches] = std::int32_t(patches.size());
   sizes[size_slots] = plan.patch_slot.back();
   sizes[size_shared] = std::int32_t(plan.shared_start.size() - 1);
-  sizes[size_parts] = std::int32_t(plan.piece_part.size());
+  sizes[size_parts] = std::int32_t(plan.part_row.size());
+  sizes[size_sums] = std::int32_t(plan.sum_rows.size() / 2);
+  sizes[size_sum_levels] = pieces > 0 ? std::int32_t(plan.level_sum.size()) - 1 : 0;
   sizes[size_senders] = std::int32_t(plan.slot_sender.size() / 8);
   for (std::size_t p = 0; p < patches.size(); ++p) {
     const auto raise = [&](DeviceSize which, std::int64_t size) {
@@ -343,9 +391,7 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
   if (kernel == stream_kernel) place_forces(plan);
   if (kernel == cluster_kernel) link_copies(plan);
   const std::int32_t pieces = *std::max_element(piece, piece + vertices) + 1;
-  // small parts keep all warps busy where few blocks hold an environment
-  const bool few = kernel == block_kernel || kernel == cluster_kernel;
-  if (pieces > 0) add_parts(plan, piece, pieces, few ? small_part : int(vertices));
+  if (pieces > 0) add_sums(plan, add_parts(plan, piece), pieces);
   plan.sizes = count_sizes(plan, made, elements.tet_count, pieces, kernel);
   const bool large = std::ranges::any_of(elements.groups, [](const auto& g) { return g.large; });
   if (large || !elements.averaged.is_empty()) plan.sizes[size_members] = elements.averaged.members;

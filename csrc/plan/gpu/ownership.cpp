@@ -16,12 +16,8 @@ namespace {
 // Cuts vertices in two again and again.
 class Owners {
  public:
-  Owners(const double* positions, std::int64_t vertices, const std::int64_t* tets,
-         std::int64_t count)
-      : points_(vertices), weight_(vertices, 0), start_(vertices + 1, 0), at_(4 * count) {
-    for (std::int64_t v = 0; v < vertices; ++v) {
-      for (int c = 0; c < 3; ++c) points_[v][c] = positions[3 * v + c];
-    }
+  Owners(std::int64_t vertices, const std::int64_t* tets, std::int64_t count)
+      : weight_(vertices, 0), start_(vertices + 1, 0), at_(4 * count) {
     for (std::int64_t i = 0; i < 4 * count; ++i) ++start_[tets[i] + 1];
     for (std::int64_t v = 0; v < vertices; ++v) weight_[v] = start_[v + 1];
     std::partial_sum(start_.begin(), start_.end(), start_.begin());
@@ -30,22 +26,21 @@ class Owners {
     seen_.assign(count, -1);
   }
 
-  void divide(std::span<std::int32_t> items, int first, int patches,
-              std::vector<std::int32_t>& owner) {
+  void divide(std::span<Numbered> items, int first, int patches, std::vector<std::int32_t>& owner) {
     if (patches <= 1) {
-      for (const std::int32_t v : items) owner[v] = first;
+      for (const Numbered& vertex : items) owner[vertex.number] = first;
       return;
     }
     const int left = patches / 2;
-    std::vector<std::int32_t> best;
+    std::vector<Numbered> best;
     double least = HUGE_VAL;
     std::int64_t middle = 0;
-    std::array<int, 3> axis = axes_by_length(items, points_);
+    std::array<int, 3> axis = axes_by_length(items);
     for (int turn = 0; turn < 3; ++turn) {
       std::array<int, 3> order = axis;
       std::rotate(order.begin(), order.begin() + turn, order.begin() + turn + 1);
-      std::vector<std::int32_t> cut(items.begin(), items.end());
-      std::sort(cut.begin(), cut.end(), along(order, points_));
+      std::vector<Numbered> cut(items.begin(), items.end());
+      std::sort(cut.begin(), cut.end(), along(order));
       const std::int64_t at = split(cut, left, patches);
       const double cost =
           std::max(double(std::ssize(tets_of(std::span(cut).first(at)))) / left,
@@ -61,11 +56,11 @@ class Owners {
   }
 
   // Tetrahedra that touch some vertices, ascending.
-  std::vector<std::int32_t> tets_of(std::span<const std::int32_t> items) {
+  std::vector<std::int32_t> tets_of(std::span<const Numbered> items) {
     std::vector<std::int32_t> tets;
     ++round_;
-    for (const std::int32_t v : items) {
-      for (std::int64_t i = start_[v]; i < start_[v + 1]; ++i) {
+    for (const Numbered& vertex : items) {
+      for (std::int64_t i = start_[vertex.number]; i < start_[vertex.number + 1]; ++i) {
         if (seen_[at_[i]] == round_) continue;
         seen_[at_[i]] = round_;
         tets.push_back(at_[i]);
@@ -77,15 +72,14 @@ class Owners {
 
  private:
   // The cut with tetrahedra left and right in the ratio of their patches, and at least one vertex for every patch.
-  std::int64_t split(std::span<const std::int32_t> cut, int left, int patches) const {
+  std::int64_t split(std::span<const Numbered> cut, int left, int patches) const {
     std::int64_t all = 0, sum = 0;
-    for (const std::int32_t v : cut) all += weight_[v];
+    for (const Numbered& vertex : cut) all += weight_[vertex.number];
     std::int64_t at = 0;
-    while (at < std::ssize(cut) && sum * patches < all * left) sum += weight_[cut[at++]];
+    while (at < std::ssize(cut) && sum * patches < all * left) sum += weight_[cut[at++].number];
     return std::clamp<std::int64_t>(at, left, std::ssize(cut) - (patches - left));
   }
 
-  std::vector<Point> points_;
   std::vector<std::int64_t> weight_, start_;  // tetrahedra of each vertex; where at_ has them
   std::vector<std::int32_t> at_;
   std::vector<std::int64_t> seen_;  // last round that met a tetrahedron
@@ -96,14 +90,17 @@ class Owners {
 
 Ownership own_vertices(const double* positions, std::int64_t vertices, const std::int64_t* tets,
                        std::int64_t count, std::int64_t patches) {
-  Owners cutter(positions, vertices, tets, count);
-  std::vector<std::int32_t> items(vertices);
-  std::iota(items.begin(), items.end(), 0);
+  Owners cutter(vertices, tets, count);
+  std::vector<Numbered> items(vertices);
+  for (std::int64_t v = 0; v < vertices; ++v) {
+    const double* x = positions + 3 * v;
+    items[v] = {{x[0], x[1], x[2]}, std::int32_t(v)};
+  }
   Ownership owned{{{}, {0}}, std::vector<std::int32_t>(vertices)};
   cutter.divide(items, 0, int(patches), owned.owner);
-  std::vector<std::vector<std::int32_t>> own(patches);
-  for (std::int64_t v = 0; v < vertices; ++v) own[owned.owner[v]].push_back(std::int32_t(v));
-  for (const std::vector<std::int32_t>& mine : own) {
+  std::vector<std::vector<Numbered>> own(patches);
+  for (const Numbered& vertex : items) own[owned.owner[vertex.number]].push_back(vertex);
+  for (const std::vector<Numbered>& mine : own) {
     const std::vector<std::int32_t> touched = cutter.tets_of(mine);
     owned.mesh.elements.insert(owned.mesh.elements.end(), touched.begin(), touched.end());
     owned.mesh.start.push_back(std::ssize(owned.mesh.elements));

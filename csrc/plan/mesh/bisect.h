@@ -5,20 +5,24 @@
 #include <array>
 #include <cstdint>
 #include <span>
-#include <vector>
 
 namespace pd {
 
 using Point = std::array<double, 3>;
 
+// A point with the number of what it stands for.
+struct Numbered {
+  Point point;
+  std::int32_t number;
+};
+
 // The axes by side length of the points' bounding box, longest first.
-inline std::array<int, 3> axes_by_length(std::span<const std::int32_t> items,
-                                         const std::vector<Point>& points) {
-  Point low = points[items[0]], high = low;
-  for (const std::int32_t i : items) {
+inline std::array<int, 3> axes_by_length(std::span<const Numbered> items) {
+  Point low = items[0].point, high = low;
+  for (const Numbered& item : items) {
     for (int c = 0; c < 3; ++c) {
-      low[c] = std::min(low[c], points[i][c]);
-      high[c] = std::max(high[c], points[i][c]);
+      low[c] = std::min(low[c], item.point[c]);
+      high[c] = std::max(high[c], item.point[c]);
     }
   }
   std::array<int, 3> axis = {0, 1, 2};
@@ -29,12 +33,12 @@ inline std::array<int, 3> axes_by_length(std::span<const std::int32_t> items,
 
 // Order along the first axis, then the others, then by number, so that all platforms make the same plan. A layer that
 // is cut itself is thus cut across.
-inline auto along(const std::array<int, 3>& axis, const std::vector<Point>& points) {
-  return [&](std::int32_t a, std::int32_t b) {
+inline auto along(const std::array<int, 3>& axis) {
+  return [axis](const Numbered& a, const Numbered& b) {
     for (const int c : axis) {
-      if (points[a][c] != points[b][c]) return points[a][c] < points[b][c];
+      if (a.point[c] != b.point[c]) return a.point[c] < b.point[c];
     }
-    return a < b;
+    return a.number < b.number;
   };
 }
 

@@ -1,6 +1,7 @@
 // The elements of a scene as the plans cut them: tetrahedra of solids, then stencils of other kinds.
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <span>
 #include <vector>
@@ -63,6 +64,11 @@ struct MeshElements {
   std::int32_t member(std::int64_t element, int which) const {
     return averaged.is_empty() ? std::int32_t(element)
                                : averaged.tets[averaged.start[element] + which];
+  }
+
+  std::array<std::int64_t, 4> tet(std::int64_t number) const {
+    const std::int64_t* v = tets + 4 * number;
+    return {v[0], v[1], v[2], v[3]};
   }
 
   // vertices of an element, repeated where tetrahedra of a group share them: solids are counted first, then the groups

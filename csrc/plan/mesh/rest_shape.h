@@ -7,14 +7,20 @@
 
 namespace pd {
 
-struct Rest {
+struct RestShape {
   std::array<double, 9> inverse;  // Dm^-1, row by row: the shape gradients of corners 1 to 3
   double volume;                  // negative for inverted winding of the corners
-  double bound;                   // l_e
+
+  // of all four corners
+  std::array<std::array<double, 3>, 4> gradients() const;
 };
 
 // Rest shape of the four rows `tet` of `positions` [vertices, 3].
-Rest rest_of(const double* positions, const std::array<std::int64_t, 4>& tet);
+RestShape rest_shape(const double* positions, const std::array<std::int64_t, 4>& tet);
+
+// l_e of as many tetrahedra at once, see element_bound.
+constexpr std::size_t bound_lanes = 8;
+std::array<double, bound_lanes> tet_bounds(const std::array<RestShape, bound_lanes>& shapes);
 
 // Inverse rest matrices of one or two tetrahedra on the face of corners 0, 1 and 2, in the frame of
 // elements/solid_pair.h. The numbers are p, q and r of the face, then s, t and h for each of the apexes 3 and 4 [1/m].

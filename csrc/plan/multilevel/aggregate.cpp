@@ -1,10 +1,14 @@
 #include "plan/multilevel/aggregate.h"
 
+#include "threads/team.h"
+
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <limits>
 #include <numeric>
 #include <queue>
+#include <span>
 #include <utility>
 
 namespace pd {
@@ -16,10 +20,75 @@ constexpr double weakest =
     0.01;  // clip of the relative strength: an edge is at most 100 times its distance long
 constexpr double never = std::numeric_limits<double>::infinity();
 
-// Dijkstra's method from any number of sources. Ties go to the lower number, so that all platforms agree.
+// A vertex at a distance. Ties go to the lower number, so that all platforms agree.
+using Item = std::pair<double, std::int32_t>;
+
+// A queue for Dijkstra's method: a ring of buckets of equal width, of which only the current one is in order. The ring
+// is longer than the longest edge, so that no two widths meet in one bucket.
+class Calendar {
+ public:
+  explicit Calendar(double longest)
+      : bucket_(buckets), per_width_(longest > 0 ? (buckets - 2) / longest : 0) {}
+
+  void push(const Item& item) {
+    const std::int64_t number = number_of(item);
+    number == current_ ? late_.push(item) : bucket_[number % buckets].push_back(item);
+    ++count_;
+  }
+
+  // Takes the next item that `is_valid`; false if there is none. Whatever is pushed later is no nearer.
+  template <class IsValid>
+  bool pop(Item& item, IsValid is_valid) {
+    while (count_ > 0) {
+      if (next_ == sorted_.size() && late_.empty()) {
+        open(is_valid);
+        continue;
+      }
+      --count_;
+      if (next_ < sorted_.size() && (late_.empty() || sorted_[next_] < late_.top())) {
+        item = sorted_[next_++];
+      } else {
+        item = late_.top();
+        late_.pop();
+      }
+      if (is_valid(item)) return true;
+    }
+    // the next source is at distance 0
+    current_ = -1;
+    return false;
+  }
+
+ private:
+  static constexpr std::int64_t buckets = 1 << 12;
+
+  std::int64_t number_of(const Item& item) const { return std::int64_t(item.first * per_width_); }
+
+  template <class IsValid>
+  void open(IsValid is_valid) {
+    do ++current_;
+    while (bucket_[current_ % buckets].empty());
+    sorted_.clear();
+    next_ = 0;
+    std::vector<Item>& items = bucket_[current_ % buckets];
+    count_ -= std::ssize(items);
+    std::copy_if(items.begin(), items.end(), std::back_inserter(sorted_), is_valid);
+    items.clear();
+    count_ += std::ssize(sorted_);
+    std::sort(sorted_.begin(), sorted_.end());
+  }
+
+  std::vector<std::vector<Item>> bucket_;
+  std::vector<Item> sorted_;                                               // the current bucket
+  std::size_t next_ = 0;                                                   // of them
+  std::priority_queue<Item, std::vector<Item>, std::greater<Item>> late_;  // pushed since into it
+  double per_width_;
+  std::int64_t current_ = -1, count_ = 0;
+};
+
+// Dijkstra's method from any number of sources.
 class Fronts {
  public:
-  explicit Fronts(const Graph& graph) : graph_(graph) { clear(); }
+  explicit Fronts(const Graph& graph) : graph_(graph), queue_(graph.longest) { clear(); }
 
   void clear() {
     distance.assign(graph_.vertices(), never);
@@ -29,23 +98,19 @@ class Fronts {
   void add_source(std::int32_t vertex, std::int32_t its_label) {
     distance[vertex] = 0;
     label[vertex] = its_label;
-    queue_.emplace(0.0, vertex);
+    queue_.push({0.0, vertex});
   }
 
-  // `may_cross(a, b)`: whether the front may pass from a to b
-  template <class MayCross>
-  void advance(MayCross may_cross) {
-    while (!queue_.empty()) {
-      const auto [d, v] = queue_.top();
-      queue_.pop();
-      if (d > distance[v]) continue;
-      for (std::int32_t e = graph_.start[v]; e < graph_.start[v + 1]; ++e) {
-        const std::int32_t u = graph_.neighbour[e];
-        const double there = d + graph_.length[e];
-        if (!(there < distance[u]) || !may_cross(v, u)) continue;
+  void advance() {
+    const auto is_valid = [&](const Item& item) { return item.first <= distance[item.second]; };
+    for (Item item; queue_.pop(item, is_valid);) {
+      const auto [d, v] = item;
+      for (const auto& [length, u] : graph_.edges(v)) {
+        const double there = d + length;
+        if (!(there < distance[u])) continue;
         distance[u] = there;
         label[u] = label[v];
-        queue_.emplace(there, u);
+        queue_.push({there, u});
       }
     }
   }
@@ -54,44 +119,67 @@ class Fronts {
   std::vector<std::int32_t> label;
 
  private:
-  using Item = std::pair<double, std::int32_t>;
   const Graph& graph_;
-  std::priority_queue<Item, std::vector<Item>, std::greater<Item>> queue_;
+  Calendar queue_;
 };
 
 // Assigns every vertex to the nearest centre; a component without a centre gets one.
 void join_nearest(Fronts& fronts, std::vector<std::int32_t>& centres,
                   const std::vector<std::uint8_t>& left_out) {
-  const auto anywhere = [](std::int32_t, std::int32_t) { return true; };
   fronts.clear();
   for (std::size_t i = 0; i < centres.size(); ++i) fronts.add_source(centres[i], std::int32_t(i));
-  fronts.advance(anywhere);
+  fronts.advance();
   for (std::size_t v = 0; v < left_out.size(); ++v) {
     if (left_out[v] || fronts.label[v] >= 0) continue;
     fronts.add_source(std::int32_t(v), std::int32_t(centres.size()));
     centres.push_back(std::int32_t(v));
-    fronts.advance(anywhere);
+    fronts.advance();
   }
 }
 
+// The vertex of an aggregate farthest from its border; `otherwise` without a border. `distance` is infinite at its
+// `members` before the call.
+std::int32_t deepest(const Graph& graph, const std::vector<std::int32_t>& label,
+                     std::span<const std::int32_t> members, std::vector<double>& distance,
+                     std::int32_t otherwise) {
+  const auto is_inside = [&](std::int32_t a, std::int32_t b) { return label[a] == label[b]; };
+  std::priority_queue<Item, std::vector<Item>, std::greater<Item>> queue;
+  for (const std::int32_t v : members) {
+    if (std::ranges::all_of(graph.edges(v),
+                            [&](const auto& e) { return is_inside(e.neighbour, v); }))
+      continue;
+    distance[v] = 0;
+    queue.emplace(0.0, v);
+  }
+  while (!queue.empty()) {
+    const auto [d, v] = queue.top();
+    queue.pop();
+    if (d > distance[v]) continue;
+    for (const auto& [length, u] : graph.edges(v)) {
+      const double there = d + length;
+      if (!is_inside(u, v) || !(there < distance[u])) continue;
+      distance[u] = there;
+      queue.emplace(there, u);
+    }
+  }
+  double most = -1;
+  for (const std::int32_t v : members) {
+    if (distance[v] == never || !(distance[v] > most)) continue;
+    most = distance[v];
+    otherwise = v;
+  }
+  return otherwise;
+}
+
 // Moves each centre to the vertex farthest from the border of its aggregate; without a border it stays.
-void centre(const Graph& graph, const std::vector<std::int32_t>& label, Fronts& depth,
-            std::vector<std::int32_t>& centres) {
-  depth.clear();
-  for (std::int32_t v = 0; v < graph.vertices(); ++v) {
-    const auto first = graph.neighbour.begin() + graph.start[v],
-               end = graph.neighbour.begin() + graph.start[v + 1];
-    if (std::any_of(first, end, [&](std::int32_t u) { return label[u] != label[v]; }))
-      depth.add_source(v, label[v]);
-  }
-  depth.advance([&](std::int32_t a, std::int32_t b) { return label[a] == label[b]; });
-  std::vector<double> deepest(centres.size(), -1.0);
-  for (std::int32_t v = 0; v < graph.vertices(); ++v) {
-    const std::int32_t l = label[v];
-    if (l < 0 || depth.distance[v] == never || !(depth.distance[v] > deepest[l])) continue;
-    deepest[l] = depth.distance[v];
-    centres[l] = v;
-  }
+void centre(const Graph& graph, const std::vector<std::int32_t>& label,
+            std::vector<std::int32_t>& centres, int threads) {
+  const Members members = members_of({label, std::int32_t(centres.size())});
+  std::vector<double> distance(label.size(), never);
+  run_team(threads, [&](const Team& team) {
+    for (std::int64_t i = team.begin(std::ssize(centres)); i < team.end(std::ssize(centres)); ++i)
+      centres[i] = deepest(graph, label, members.of(i), distance, centres[i]);
+  });
 }
 
 // Moves each centre to the vertex nearest to the centroid of its aggregate.
@@ -119,8 +207,23 @@ void centre_in_space(const Positions& position, const std::vector<std::int32_t>&
 
 }  // namespace
 
+Members members_of(const Aggregates& groups) {
+  Members members{std::vector<std::int32_t>(groups.count + 1, 0), {}};
+  for (const std::int32_t g : groups.of) {
+    if (g >= 0) ++members.start[g + 1];
+  }
+  std::partial_sum(members.start.begin(), members.start.end(), members.start.begin());
+  members.vertex.resize(members.start.back());
+  std::vector<std::int32_t> next(members.start.begin(), members.start.end() - 1);
+  for (std::size_t v = 0; v < groups.of.size(); ++v) {
+    if (groups.of[v] >= 0) members.vertex[next[groups.of[v]]++] = std::int32_t(v);
+  }
+  return members;
+}
+
 Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplings) {
   std::vector<double> strengths;
+  strengths.reserve(couplings.size());
   for (const Coupling& c : couplings) strengths.push_back(c.strength);
   double quartile = 1;
   if (!strengths.empty()) {
@@ -135,15 +238,13 @@ Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplin
     ++graph.start[c.b + 1];
   }
   std::partial_sum(graph.start.begin(), graph.start.end(), graph.start.begin());
-  graph.neighbour.resize(2 * couplings.size());
-  graph.length.resize(2 * couplings.size());
+  graph.edge.resize(2 * couplings.size());
   std::vector<std::int32_t> next(graph.start.begin(), graph.start.end() - 1);
   for (const Coupling& c : couplings) {
     const double length = c.distance / std::clamp(c.strength / quartile, weakest, 1.0);
-    for (const auto& [from, to] : {std::pair{c.a, c.b}, std::pair{c.b, c.a}}) {
-      graph.neighbour[next[from]] = to;
-      graph.length[next[from]++] = length;
-    }
+    graph.longest = std::max(graph.longest, length);
+    graph.edge[next[c.a]++] = {length, c.b};
+    graph.edge[next[c.b]++] = {length, c.a};
   }
   return graph;
 }
@@ -156,7 +257,7 @@ std::int32_t connected_components(const Graph& graph, const std::vector<std::uin
 }
 
 Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_out,
-                     std::int32_t wanted) {
+                     std::int32_t wanted, int threads) {
   // neighbours in space have near numbers, so spacing the numbers spaces the centres
   std::vector<std::int32_t> candidates, centres;
   for (std::int32_t v = 0; v < graph.vertices(); ++v) {
@@ -165,10 +266,10 @@ Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_o
   const std::int64_t count = std::min<std::int64_t>(wanted, std::ssize(candidates));
   for (std::int64_t i = 0; i < count; ++i)
     centres.push_back(candidates[std::ssize(candidates) * (2 * i + 1) / (2 * count)]);
-  Fronts fronts(graph), depth(graph);
+  Fronts fronts(graph);
   for (int sweep = 0; sweep < sweeps; ++sweep) {
     join_nearest(fronts, centres, left_out);
-    if (sweep + 1 < sweeps) centre(graph, fronts.label, depth, centres);
+    if (sweep + 1 < sweeps) centre(graph, fronts.label, centres, threads);
   }
   return {std::move(fronts.label), std::int32_t(centres.size())};
 }
@@ -186,7 +287,7 @@ Aggregates aggregate_far_apart(const Graph& graph, const std::vector<std::uint8_
   };
   const auto spread_from = [&](std::int32_t vertex) {
     fronts.add_source(vertex, 0);
-    fronts.advance([](std::int32_t, std::int32_t) { return true; });
+    fronts.advance();
   };
   // start at a vertex on the rim
   if (const std::int32_t any = farthest(); any >= 0) {
@@ -215,7 +316,7 @@ std::vector<double> distances_to(const Graph& graph, const Aggregates& aggregate
   for (std::int32_t v = 0; v < graph.vertices(); ++v) {
     if (aggregates.of[v] == aggregate) fronts.add_source(v, aggregate);
   }
-  fronts.advance([](std::int32_t, std::int32_t) { return true; });
+  fronts.advance();
   return std::move(fronts.distance);
 }
 

@@ -3,6 +3,7 @@
 
 #include <array>
 #include <cstdint>
+#include <span>
 #include <vector>
 
 namespace pd {
@@ -13,10 +14,19 @@ struct Coupling {
   double strength, distance;
 };
 
-// Neighbours and lengths of the edges; weak ones are long.
+// The edges of each vertex; weak ones are long.
 struct Graph {
-  std::vector<std::int32_t> start, neighbour;
-  std::vector<double> length;
+  struct Edge {
+    double length;
+    std::int32_t neighbour;
+  };
+  std::vector<std::int32_t> start;
+  std::vector<Edge> edge;
+  double longest = 0;
+
+  std::span<const Edge> edges(std::int32_t vertex) const {
+    return {edge.data() + start[vertex], edge.data() + start[vertex + 1]};
+  }
 
   std::int32_t vertices() const { return std::int32_t(start.size()) - 1; }
 };
@@ -27,16 +37,27 @@ Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplin
 // Number of connected components of the graph without the vertices `left_out`.
 std::int32_t connected_components(const Graph& graph, const std::vector<std::uint8_t>& left_out);
 
-// Aggregate of each vertex, -1 where `left_out`, and their count: about `wanted`, more if the graph has more
-// components. Six sweeps: every vertex joins the nearest centre, then every centre moves to the deepest vertex of its
-// aggregate.
+// Aggregate of each vertex, -1 where `left_out`, and their count.
 struct Aggregates {
   std::vector<std::int32_t> of;
   std::int32_t count = 0;
 };
 
+// The vertices of each aggregate, ascending.
+struct Members {
+  std::vector<std::int32_t> start, vertex;
+
+  std::span<const std::int32_t> of(std::int64_t aggregate) const {
+    return {vertex.data() + start[aggregate], vertex.data() + start[aggregate + 1]};
+  }
+};
+
+Members members_of(const Aggregates& groups);
+
+// About `wanted` aggregates, more if the graph has more components. Six sweeps: every vertex joins the nearest centre,
+// then every centre moves to the deepest vertex of its aggregate.
 Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_out,
-                     std::int32_t wanted);
+                     std::int32_t wanted, int threads);
 
 using Positions = std::vector<std::array<double, 3>>;
 

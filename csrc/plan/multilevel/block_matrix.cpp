@@ -3,6 +3,7 @@
 #include "threads/team.h"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <numeric>
 #include <stdexcept>
@@ -11,122 +12,114 @@ namespace pd {
 
 namespace {
 
-// One row of a product in progress: its columns in order of appearance, and a dense block for each.
-class RowSum {
- public:
-  RowSum(std::int32_t columns, std::int64_t block) : place_(columns, -1), block_(block) {}
+constexpr int width = 4;  // of the right factor of a product
 
-  double* at(std::int32_t column) {
-    if (place_[column] < 0) {
-      place_[column] = std::int32_t(column_.size());
-      column_.push_back(column);
-      value_.resize(value_.size() + block_, 0.0);
-    }
-    return value_.data() + place_[column] * block_;
-  }
-
-  // appends the row in ascending order and clears it
-  void move_to(std::vector<std::int32_t>& column, std::vector<double>& value) {
-    std::vector<std::int32_t>& ordered = ordered_;
-    ordered = column_;
-    std::sort(ordered.begin(), ordered.end());
-    for (const std::int32_t c : ordered) {
-      const double* from = value_.data() + place_[c] * block_;
-      column.push_back(c);
-      value.insert(value.end(), from, from + block_);
-      place_[c] = -1;
-    }
-    column_.clear();
-    value_.clear();
-  }
-
- private:
-  std::vector<std::int32_t> place_, column_, ordered_;
-  std::vector<double> value_;
-  std::int64_t block_;
-};
-
-// c += a b of blocks [h, k] and [k, w]
-void add_product(const double* a, const double* b, int h, int k, int w, double* c) {
-  for (int i = 0; i < h; ++i) {
-    for (int j = 0; j < k; ++j) {
-      const double f = a[i * k + j];
-      for (int l = 0; l < w; ++l) c[i * w + l] += f * b[j * w + l];
+// c += a b of blocks [H, K] and [K, 4]; a^T is stored if `Transposed`.
+template <int H, int K, bool Transposed>
+void add_product(const double* a, const double* b, double* __restrict c) {
+  for (int i = 0; i < H; ++i) {
+    for (int j = 0; j < K; ++j) {
+      const double f = a[Transposed ? j * H + i : i * K + j];
+      for (int l = 0; l < width; ++l) c[i * width + l] += f * b[j * width + l];
     }
   }
 }
 
-// The rows made by one thread.
-struct Part {
-  std::vector<std::int32_t> length, column;
-  std::vector<double> value;
+// Rows of a left factor: the columns of their entries, and their blocks, counted in `value`.
+struct Left {
+  std::int32_t rows;
+  const std::vector<std::int32_t>&start, &column;
+  const std::vector<double>& value;
+  const std::int32_t* block;  // null: their own numbers
 };
 
-}  // namespace
-
-BlockMatrix multiply(const BlockMatrix& a, const BlockMatrix& b, int threads) {
-  BlockMatrix c{a.height, b.width, a.rows, b.columns, {0}, {}, {}};
-  std::vector<Part> parts(threads);
-  run_team(threads, [&](const Team& team) {
-    Part& part = parts[team.rank];
-    RowSum sum(b.columns, c.block());
-    for (std::int64_t row = team.begin(a.rows); row < team.end(a.rows); ++row) {
-      const std::size_t before = part.column.size();
-      for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
-        const std::int32_t k = a.column[p];
-        for (std::int32_t q = b.start[k]; q < b.start[k + 1]; ++q) {
-          add_product(a.value.data() + p * a.block(), b.value.data() + q * b.block(), a.height,
-                      a.width, b.width, sum.at(b.column[q]));
-        }
+template <int H, int K, bool Transposed>
+BlockMatrix product(const Left& a, const BlockMatrix& b, int threads) {
+  BlockMatrix c{H, width, a.rows, b.columns, {}, {}, {}};
+  sum_rows(c, 0.0, threads, [&a, &b](std::int32_t row, RowSum& sum) {
+    const std::int32_t *const column = b.column.data(), *const start = b.start.data();
+    const double* const value = b.value.data();
+    const std::int32_t end = a.start[row + 1];
+    for (std::int32_t p = a.start[row]; p < end; ++p) {
+      const std::int64_t number = Transposed ? a.block[p] : p;
+      std::array<double, H * K> block;
+      std::copy_n(a.value.data() + number * H * K, H * K, block.begin());
+      const std::int32_t k = a.column[p], last = start[k + 1];
+      for (std::int32_t q = start[k]; q < last; ++q) {
+        add_product<H, K, Transposed>(block.data(), value + std::int64_t(q) * K * width,
+                                      sum.at(column[q]));
       }
-      sum.move_to(part.column, part.value);
-      part.length.push_back(std::int32_t(part.column.size() - before));
     }
   });
-  for (const Part& part : parts) {
-    if (c.column.size() + part.column.size() > std::size_t(INT32_MAX))
-      throw std::invalid_argument("a preconditioner may have up to 2^31 matrix entries a level");
-    for (const std::int32_t length : part.length) c.start.push_back(c.start.back() + length);
-    c.column.insert(c.column.end(), part.column.begin(), part.column.end());
-    c.value.insert(c.value.end(), part.value.begin(), part.value.end());
-  }
   return c;
 }
 
+}  // namespace
+
+void join_rows(BlockMatrix& m, std::vector<MatrixRows>& batches, int threads) {
+  m.start.assign(1, 0);
+  std::vector<std::int64_t> first;
+  std::int64_t count = 0;
+  for (const MatrixRows& rows : batches) {
+    first.push_back(count);
+    count += std::ssize(rows.column);
+    if (count > INT32_MAX)
+      throw std::invalid_argument("a preconditioner may have up to 2^31 matrix entries a level");
+    for (const std::int32_t length : rows.length) m.start.push_back(m.start.back() + length);
+  }
+  m.column.resize(count);
+  m.value.resize(count * m.block());
+  for_rows(std::ssize(batches), threads, [&](std::int64_t b) {
+    const MatrixRows rows = std::move(batches[b]);
+    std::ranges::copy(rows.column, m.column.begin() + first[b]);
+    std::ranges::copy(rows.value, m.value.begin() + first[b] * m.block());
+  });
+}
+
+BlockMatrix multiply(const BlockMatrix& a, const BlockMatrix& b, int threads) {
+  const Left left{a.rows, a.start, a.column, a.value, nullptr};
+  return a.height == 1 ? product<1, 1, false>(left, b, threads)
+                       : product<4, 4, false>(left, b, threads);
+}
+
 Transposed transpose(const BlockMatrix& a) {
-  Transposed t{{a.width, a.height, a.columns, a.rows, {}, {}, {}}, {}};
-  t.matrix.start.assign(a.columns + 1, 0);
-  for (const std::int32_t c : a.column) ++t.matrix.start[c + 1];
-  std::partial_sum(t.matrix.start.begin(), t.matrix.start.end(), t.matrix.start.begin());
-  std::vector<std::int32_t> next(t.matrix.start.begin(), t.matrix.start.end() - 1);
-  t.matrix.column.resize(a.column.size());
-  t.matrix.value.resize(a.value.size());
+  Transposed t;
+  t.start.assign(a.columns + 1, 0);
+  for (const std::int32_t c : a.column) ++t.start[c + 1];
+  std::partial_sum(t.start.begin(), t.start.end(), t.start.begin());
+  std::vector<std::int32_t> next(t.start.begin(), t.start.end() - 1);
+  t.column.resize(a.column.size());
   t.from.resize(a.column.size());
   for (std::int32_t row = 0; row < a.rows; ++row) {
     for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
       const std::int32_t to = next[a.column[p]]++;
-      t.matrix.column[to] = row;
+      t.column[to] = row;
       t.from[to] = p;
-      for (int i = 0; i < a.height; ++i) {
-        for (int j = 0; j < a.width; ++j)
-          t.matrix.value[to * a.block() + j * a.height + i] =
-              a.value[p * a.block() + i * a.width + j];
-      }
     }
   }
   return t;
 }
 
+BlockMatrix multiply_transposed(const BlockMatrix& a, const Transposed& transposed,
+                                const BlockMatrix& b, int threads) {
+  const Left left{a.columns, transposed.start, transposed.column, a.value, transposed.from.data()};
+  return a.height == 1 ? product<4, 1, true>(left, b, threads)
+                       : product<4, 4, true>(left, b, threads);
+}
+
 void apply(const BlockMatrix& a, const std::vector<double>& x, std::vector<double>& y,
            int threads) {
-  y.assign(std::size_t(a.rows) * a.height, 0.0);
-  run_team(threads, [&](const Team& team) {
-    for (std::int64_t row = team.begin(a.rows); row < team.end(a.rows); ++row) {
-      for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
-        add_product(a.value.data() + p * a.block(), x.data() + std::int64_t(a.column[p]) * a.width,
-                    a.height, a.width, 1, y.data() + row * a.height);
+  y.resize(std::size_t(a.rows) * a.height);
+  for_rows(a.rows, threads, [&](std::int64_t row) {
+    std::array<double, 4> sum{};
+    for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
+      const double* block = a.value.data() + p * a.block();
+      const double* own = x.data() + std::int64_t(a.column[p]) * a.width;
+      for (int i = 0; i < a.height; ++i) {
+        for (int j = 0; j < a.width; ++j) sum[i] += block[i * a.width + j] * own[j];
       }
     }
+    std::copy_n(sum.begin(), a.height, y.begin() + row * a.height);
   });
 }
 

@@ -4,19 +4,19 @@
 #include "plan/multilevel/block_matrix.h"
 #include "plan/multilevel/fine_matrix.h"
 #include "plan/multilevel/pieces.h"
-#include "solver/multilevel/lbfgs.h"
+#include "plan/multilevel/prolongation.h"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <stdexcept>
+#include <functional>
+#include <numeric>
 #include <utility>
 
 namespace pd {
 
 namespace {
 
-constexpr int functions = 4;                        // 1, x, y, z
 constexpr int most_coarse_nodes = 256;              // 1024 unknowns of the dense level
 constexpr std::int32_t most_of_two_levels = 12000;  // two levels serve up to so many free vertices
 constexpr double fine_smoothing = 1.14, middle_smoothing = 1.333;  // omega of I - omega D^-1 A
@@ -24,7 +24,6 @@ constexpr double weakest_coupling = 0.02;  // relative to the scaled blocks of m
 constexpr int turning_groups = 4;          // as in solver/multilevel/deflation.h
 constexpr double turning_reach = 2;        // overlap of groups, in mean depths of their vertices
 constexpr double coarse_shift = 1e-12;  // relative to the diagonal: above the rounding of a pivot
-constexpr double dependent = 1e-8;      // orthogonalisation leaves less of a dependent column
 
 // Diagonal of a matrix of square blocks.
 std::vector<double> diagonal(const BlockMatrix& a) {
@@ -41,13 +40,13 @@ std::vector<double> diagonal(const BlockMatrix& a) {
 
 // Edges of a matrix: Frobenius norms of its blocks, scaled by the diagonal, where larger than `least`.
 std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>& d,
-                                const std::vector<std::array<double, 3>>& centre, double least) {
-  std::vector<Coupling> found;
-  for (std::int32_t row = 0; row < a.rows; ++row) {
+                                const std::vector<std::array<double, 3>>& centre, double least,
+                                int threads) {
+  const auto for_couplings = [&](std::int64_t row, auto work) {
     for (std::int32_t p = a.start[row]; p < a.start[row + 1]; ++p) {
       const std::int32_t column = a.column[p];
       if (column <= row) continue;
-      double sum = 0, square = 0;
+      double sum = 0;
       for (int i = 0; i < a.height; ++i) {
         for (int j = 0; j < a.width; ++j) {
           const double v = a.value[p * a.block() + i * a.width + j];
@@ -56,96 +55,26 @@ std::vector<Coupling> couplings(const BlockMatrix& a, const std::vector<double>&
           if (scale > 0) sum += v * v / scale;
         }
       }
+      if (sum > least * least) work(column, sum);
+    }
+  };
+  std::vector<std::int64_t> place(std::size_t(a.rows) + 1, 0);
+  for_rows(a.rows, threads, [&](std::int64_t row) {
+    for_couplings(row, [&](std::int32_t, double) { ++place[row + 1]; });
+  });
+  std::partial_sum(place.begin(), place.end(), place.begin());
+  std::vector<Coupling> found(place.back());
+  for_rows(a.rows, threads, [&](std::int64_t row) {
+    for_couplings(row, [&](std::int32_t column, double sum) {
+      double square = 0;
       for (int c = 0; c < 3; ++c) {
         const double side = centre[row][c] - centre[column][c];
         square += side * side;
       }
-      if (sum > least * least) found.push_back({row, column, std::sqrt(sum), std::sqrt(square)});
-    }
-  }
+      found[place[row]++] = {std::int32_t(row), column, std::sqrt(sum), std::sqrt(square)};
+    });
+  });
   return found;
-}
-
-// Orthonormalises the four columns of q [rows, 4]; a dependent column becomes zero. Returns R of the factorisation q
-// R.
-std::array<double, 16> orthonormalise(std::vector<double>& q) {
-  std::array<double, 16> r{};
-  const std::size_t rows = q.size() / functions;
-  const auto dot = [&](int a, int b) {
-    double sum = 0;
-    for (std::size_t i = 0; i < rows; ++i) sum += q[i * functions + a] * q[i * functions + b];
-    return sum;
-  };
-  for (int c = 0; c < functions; ++c) {
-    const double before = std::sqrt(dot(c, c));
-    // twice is enough (Kahan and Parlett)
-    for (int pass = 0; pass < 2; ++pass) {
-      for (int k = 0; k < c; ++k) {
-        const double part = dot(k, c);
-        r[k * functions + c] += part;
-        for (std::size_t i = 0; i < rows; ++i) q[i * functions + c] -= part * q[i * functions + k];
-      }
-    }
-    const double left = std::sqrt(dot(c, c)), scale = left > dependent * before ? 1 / left : 0;
-    r[c * functions + c] = scale > 0 ? left : 0;
-    for (std::size_t i = 0; i < rows; ++i) q[i * functions + c] *= scale;
-  }
-  return r;
-}
-
-// The tentative prolongation: candidates [rows, height, 4], made orthonormal on each aggregate.
-struct Tentative {
-  BlockMatrix prolongation;     // one block a row
-  std::vector<double> reduced;  // R [aggregates, 4, 4]: the candidates of the next level
-};
-
-Tentative tentative(const std::vector<double>& candidates, int height, const Aggregates& groups) {
-  const std::int32_t rows = std::int32_t(groups.of.size());
-  const int block = height * functions;
-  Tentative t{{height, functions, rows, groups.count, {0}, {}, {}}, {}};
-  std::vector<std::vector<std::int32_t>> members(groups.count);
-  for (std::int32_t i = 0; i < rows; ++i) {
-    if (groups.of[i] >= 0) {
-      members[groups.of[i]].push_back(i);
-      t.prolongation.column.push_back(groups.of[i]);
-    }
-    t.prolongation.start.push_back(std::int32_t(t.prolongation.column.size()));
-  }
-  t.prolongation.value.resize(t.prolongation.column.size() * block);
-  std::vector<double> q;
-  for (const auto& member : members) {
-    q.clear();
-    for (const std::int32_t i : member)
-      q.insert(q.end(), candidates.begin() + std::int64_t(i) * block,
-               candidates.begin() + (std::int64_t(i) + 1) * block);
-    const auto r = orthonormalise(q);
-    t.reduced.insert(t.reduced.end(), r.begin(), r.end());
-    for (std::size_t k = 0; k < member.size(); ++k)
-      std::copy_n(
-          q.begin() + k * block, block,
-          t.prolongation.value.begin() + std::int64_t(t.prolongation.start[member[k]]) * block);
-  }
-  return t;
-}
-
-// (I - omega D^-1 A) P
-BlockMatrix smoothed(const BlockMatrix& a, const std::vector<double>& inverse, double omega,
-                     const BlockMatrix& p, int threads) {
-  BlockMatrix prolongation = multiply(a, p, threads);
-  const std::int64_t block = prolongation.block();
-  for (std::int32_t row = 0; row < prolongation.rows; ++row) {
-    for (std::int32_t e = prolongation.start[row]; e < prolongation.start[row + 1]; ++e) {
-      const bool own =
-          p.start[row] < p.start[row + 1] && p.column[p.start[row]] == prolongation.column[e];
-      for (std::int64_t k = 0; k < block; ++k) {
-        const double scale =
-            omega * inverse[std::size_t(row) * prolongation.height + k / functions];
-        const double kept = own ? p.value[p.start[row] * block + k] : 0;
-        prolongation.value[e * block + k] = kept - scale * prolongation.value[e * block + k];
-      }
-    }
-  }
-  return prolongation;
 }
 
 // 1 / (lambda_max diag A), with lambda_max of diag(A)^-1 A from power iteration plus 5 %; 0 where there is no
@@ -203,11 +132,6 @@ std::vector<double> coarse_factor(const BlockMatrix& a, const Mask& held, int th
   return factor;
 }
 
-BlockMatrix galerkin(const BlockMatrix& a, const BlockMatrix& prolongation,
-                     const Transposed& transposed, int threads) {
-  return multiply(transposed.matrix, multiply(a, prolongation, threads), threads);
-}
-
 // Rest positions in internal order, and the affine functions on them, scaled to the size of one.
 struct Affine {
   std::vector<std::array<double, 3>> position;
@@ -216,6 +140,8 @@ struct Affine {
 
 Affine affine(const MultilevelScene& s) {
   Affine result;
+  result.position.reserve(s.elements.vertices);
+  result.candidates.reserve(node_functions * s.elements.vertices);
   std::array<double, 3> low{}, high{};
   for (std::int64_t i = 0; i < s.elements.vertices; ++i) {
     const double* x = s.elements.positions + 3 * std::int64_t(s.vertex_order[i]);
@@ -249,72 +175,13 @@ std::vector<std::array<double, 3>> mean_positions(
   return mean;
 }
 
-// The prolongation from the level below, its transpose, and the matrix of that level.
-struct Step {
-  BlockMatrix prolongation;
-  Transposed restriction;
-  BlockMatrix coarse;
-};
-
-Step coarsen(const BlockMatrix& matrix, const std::vector<double>& inverse, double omega,
-             const BlockMatrix& tentative_prolongation, int threads) {
-  Step step;
-  step.prolongation = smoothed(matrix, inverse, omega, tentative_prolongation, threads);
-  step.restriction = transpose(step.prolongation);
-  step.coarse = galerkin(matrix, step.prolongation, step.restriction, threads);
-  return step;
-}
-
-// diag(factor scale) m
-BlockMatrix scaled(BlockMatrix m, double factor, const std::vector<double>& scale) {
-  for (std::int32_t row = 0; row < m.rows; ++row) {
-    for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
-      for (std::int64_t k = 0; k < m.block(); ++k)
-        m.value[e * m.block() + k] *= factor * scale[std::size_t(row) * m.height + k / m.width];
-    }
-  }
-  return m;
-}
-
-// sum += m, where `sum` has all blocks of m
-void add_to(BlockMatrix& sum, const BlockMatrix& m) {
-  for (std::int32_t row = 0; row < m.rows; ++row) {
-    std::int32_t to = sum.start[row];
-    for (std::int32_t e = m.start[row]; e < m.start[row + 1]; ++e) {
-      while (to < sum.start[row + 1] && sum.column[to] != m.column[e]) ++to;
-      if (to == sum.start[row + 1]) throw std::logic_error("a matrix level lacks its diagonal");
-      for (std::int64_t k = 0; k < m.block(); ++k)
-        sum.value[to * m.block() + k] += m.value[e * m.block() + k];
-    }
-  }
-}
-
-// (I - S A) P with a level's smoother S = (keep first + second) D^-1 - second first D^-1 A D^-1.
-BlockMatrix folded(const BlockMatrix& a, const std::vector<double>& inverse, const BlockMatrix& p,
-                   int threads) {
-  constexpr double once = Smoother::keep * Smoother::first + Smoother::second;
-  constexpr double twice = Smoother::second * Smoother::first;
-  const BlockMatrix image = multiply(a, p, threads);
-  BlockMatrix prolongation =
-      scaled(multiply(a, scaled(image, twice, inverse), threads), 1, inverse);
-  add_to(prolongation, scaled(image, -once, inverse));
-  add_to(prolongation, p);
-  return prolongation;
-}
-
-// Folds smoothing into the prolongation and its transpose, as a GPU needs it.
-void fold(Step& step, const BlockMatrix& a, const std::vector<double>& inverse, int threads) {
-  step.prolongation = folded(a, inverse, step.prolongation, threads);
-  step.restriction = transpose(step.prolongation);
-}
-
 // The nodes below the middle level.
 Aggregates group_nodes(const BlockMatrix& matrix,
-                       const std::vector<std::array<double, 3>>& position) {
-  const Graph graph =
-      coupling_graph(matrix.rows, couplings(matrix, diagonal(matrix), position, weakest_coupling));
+                       const std::vector<std::array<double, 3>>& position, int threads) {
+  const Graph graph = coupling_graph(
+      matrix.rows, couplings(matrix, diagonal(matrix), position, weakest_coupling, threads));
   const int wanted = std::clamp(matrix.rows / 8, 1, most_coarse_nodes);
-  return limited(aggregate(graph, Mask(matrix.rows, 0), wanted), most_coarse_nodes);
+  return limited(aggregate(graph, Mask(matrix.rows, 0), wanted, threads), most_coarse_nodes);
 }
 
 // Partition of unity [vertices, 4] of four overlapping groups: 1 inside, falling to 0 over a distance, divided by the
@@ -361,19 +228,81 @@ void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<dou
 }
 
 // Stores the transposed prolongation: with the places of its values in the other, or with the `values` themselves.
-void store_nodes(Step& step, bool values, Numbers& start, Numbers& row, Numbers& from,
-                 std::vector<double>& value) {
-  start = std::move(step.restriction.matrix.start);
-  row = std::move(step.restriction.matrix.column);
-  if (!values) {
+void store_nodes(Coarsening& step, bool values, Numbers& start, Numbers& row, Numbers& from,
+                 std::vector<double>& value, int threads) {
+  if (values) {
+    const std::int64_t block = step.prolongation.block();
+    value.resize(step.prolongation.value.size());
+    for_rows(std::ssize(step.restriction.from), threads, [&](std::int64_t e) {
+      std::copy_n(step.prolongation.value.begin() + step.restriction.from[e] * block, block,
+                  value.begin() + e * block);
+    });
+  } else {
     from = std::move(step.restriction.from);
-    return;
   }
-  const std::int64_t block = step.prolongation.block();
-  for (const std::int32_t e : step.restriction.from) {
-    const auto first = step.prolongation.value.begin() + e * block;
-    value.insert(value.end(), first, first + block);
-  }
+  start = std::move(step.restriction.start);
+  row = std::move(step.restriction.column);
+}
+
+// A small mesh has no levels, but the inverse factor of its matrix.
+void store_direct(MultilevelTables& t, FineMatrix& fine, int threads) {
+  t.level_sizes[level_direct] = 1;
+  t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
+  t.fine_prolongation_start.assign(std::size_t(fine.matrix.rows) + 1, 0);
+  t.fine_node_start = {0};
+  store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+}
+
+// Whether the nodes of the free vertices need a level between them and the dense one.
+bool needs_middle(const Graph& graph, const Mask& held, std::int32_t free) {
+  return free > most_of_two_levels || connected_components(graph, held) > most_coarse_nodes;
+}
+
+// Stores the fine level; returns the matrix of the next.
+BlockMatrix add_fine_level(MultilevelTables& t, BlockMatrix& matrix, const BlockMatrix& tentative,
+                           bool folded, int threads) {
+  Coarsening step = coarsen(matrix, t.fine_inverse, fine_smoothing, tentative, threads);
+  if (folded) fold(step, matrix, t.fine_inverse, threads);
+  t.level_sizes[level_fine_prolongations] = step.prolongation.start.back();
+  t.level_sizes[level_fine_nodes] = tentative.columns;
+  store(matrix, t.fine_start, t.fine_column, t.fine_value);
+  store_nodes(step, folded, t.fine_node_start, t.fine_node_row, t.fine_node_prolongation,
+              t.fine_node_weight, threads);
+  store(step.prolongation, t.fine_prolongation_start, t.fine_prolongation_node,
+        t.fine_prolongation_weight);
+  return std::move(step.coarse);
+}
+
+// The same for the middle level, nodes at `position` with candidates [nodes, 4, 4].
+BlockMatrix add_middle_level(MultilevelTables& t, BlockMatrix matrix, const Positions& position,
+                             const std::vector<double>& candidates, bool folded, int threads) {
+  t.middle_inverse = scaled_inverse(matrix, threads);
+  const Aggregates groups = group_nodes(matrix, position, threads);
+  const Tentative last = tentative(candidates, node_functions, groups, threads);
+  Coarsening step = coarsen(matrix, t.middle_inverse, middle_smoothing, last.prolongation, threads);
+  if (folded) fold(step, matrix, t.middle_inverse, threads);
+  t.level_sizes[level_middle_entries] = matrix.start.back();
+  t.level_sizes[level_middle_prolongations] = step.prolongation.start.back();
+  t.level_sizes[level_middle_nodes] = groups.count;
+  store(matrix, t.middle_start, t.middle_column, t.middle_value);
+  store_nodes(step, folded, t.middle_node_start, t.middle_node_row, t.middle_node_prolongation,
+              t.middle_node_weight, threads);
+  store(step.prolongation, t.middle_prolongation_start, t.middle_prolongation_node,
+        t.middle_prolongation_weight);
+  return std::move(step.coarse);
+}
+
+// What does not depend on the levels.
+void store_reference(MultilevelTables& t, const MultilevelScene& scene, const FineMatrix& fine) {
+  t.fine_inverse.resize(fine.bound.size());
+  std::ranges::transform(fine.bound, t.fine_inverse.begin(),
+                         [](double bound) { return bound > 0 ? 1 / bound : 0; });
+  t.reference_stiffness.assign(scene.stiffness, scene.stiffness + scene.elements.count());
+  t.reference_inertia.reserve(scene.elements.vertices);
+  for (std::int64_t i = 0; i < scene.elements.vertices; ++i)
+    t.reference_inertia.push_back(scene.inertia[scene.vertex_order[i]]);
+  t.level_sizes.assign(level_size_count, 0);
+  t.level_sizes[level_fine_entries] = fine.matrix.start.back();
 }
 
 }  // namespace
@@ -383,65 +312,32 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   MultilevelTables t;
   FineMatrix fine = assemble(scene, threads);
   progress(0.2);
-  for (const double bound : fine.bound) t.fine_inverse.push_back(bound > 0 ? 1 / bound : 0);
-  t.reference_stiffness.assign(scene.stiffness, scene.stiffness + scene.elements.count());
-  for (std::int64_t i = 0; i < scene.elements.vertices; ++i)
-    t.reference_inertia.push_back(scene.inertia[scene.vertex_order[i]]);
-  t.level_sizes.assign(level_size_count, 0);
-  t.level_sizes[level_fine_entries] = fine.matrix.start.back();
+  store_reference(t, scene, fine);
   const Affine rest = affine(scene);
   const Graph graph = coupling_graph(
-      fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0));
-  Pieces pieces = cut_pieces(fine, graph, t.reference_inertia);
+      fine.matrix.rows, couplings(fine.matrix, diagonal(fine.matrix), rest.position, 0, threads));
+  Pieces pieces = cut_pieces(fine, graph, t.reference_inertia, threads);
   t.level_sizes[level_pieces] = pieces.count;
   t.piece_of = std::move(pieces.of);
   t.piece_weight = std::move(pieces.weight);
   if (scene.folded) t.turning_weight = turning_weights(graph, fine.held, rest.position);
   if (scene.elements.vertices <= scene.most_direct) {
-    t.level_sizes[level_direct] = 1;
-    t.coarse_factor = coarse_factor(fine.matrix, fine.held, threads);
-    t.fine_prolongation_start.assign(std::size_t(scene.elements.vertices) + 1, 0);
-    t.fine_node_start = {0};
-    store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
+    store_direct(t, fine, threads);
     progress(1.0);
     return t;
   }
   const auto free = std::int32_t(std::count(fine.held.begin(), fine.held.end(), 0));
-  const bool middle =
-      free > most_of_two_levels || connected_components(graph, fine.held) > most_coarse_nodes;
+  const bool middle = needs_middle(graph, fine.held, free);
   const std::int32_t nodes = std::max(1, free / (free < 1000 ? 15 : 30));
   const Aggregates groups =
-      aggregate(graph, fine.held, middle ? nodes : std::min(nodes, most_coarse_nodes));
+      aggregate(graph, fine.held, middle ? nodes : std::min(nodes, most_coarse_nodes), threads);
   progress(0.5);
-
-  const Tentative first = tentative(rest.candidates, 1, groups);
-  Step step = coarsen(fine.matrix, t.fine_inverse, fine_smoothing, first.prolongation, threads);
-  if (scene.folded) fold(step, fine.matrix, t.fine_inverse, threads);
-  t.level_sizes[level_fine_prolongations] = step.prolongation.start.back();
-  t.level_sizes[level_fine_nodes] = groups.count;
-  store(fine.matrix, t.fine_start, t.fine_column, t.fine_value);
-  store_nodes(step, scene.folded, t.fine_node_start, t.fine_node_row, t.fine_node_prolongation,
-              t.fine_node_weight);
-  store(step.prolongation, t.fine_prolongation_start, t.fine_prolongation_node,
-        t.fine_prolongation_weight);
+  const Tentative first = tentative(rest.candidates, 1, groups, threads);
+  BlockMatrix coarse = add_fine_level(t, fine.matrix, first.prolongation, scene.folded, threads);
   progress(0.7);
-
-  BlockMatrix coarse = std::move(step.coarse);
   if (middle) {
-    t.middle_inverse = scaled_inverse(coarse, threads);
-    const Aggregates last = group_nodes(coarse, mean_positions(rest.position, groups));
-    const Tentative second = tentative(first.reduced, functions, last);
-    step = coarsen(coarse, t.middle_inverse, middle_smoothing, second.prolongation, threads);
-    if (scene.folded) fold(step, coarse, t.middle_inverse, threads);
-    t.level_sizes[level_middle_entries] = coarse.start.back();
-    t.level_sizes[level_middle_prolongations] = step.prolongation.start.back();
-    t.level_sizes[level_middle_nodes] = last.count;
-    store(coarse, t.middle_start, t.middle_column, t.middle_value);
-    store_nodes(step, scene.folded, t.middle_node_start, t.middle_node_row,
-                t.middle_node_prolongation, t.middle_node_weight);
-    store(step.prolongation, t.middle_prolongation_start, t.middle_prolongation_node,
-          t.middle_prolongation_weight);
-    coarse = std::move(step.coarse);
+    coarse = add_middle_level(t, std::move(coarse), mean_positions(rest.position, groups),
+                              first.reduced, scene.folded, threads);
   }
   progress(0.8);
   t.coarse_factor = coarse_factor(coarse, {}, threads);

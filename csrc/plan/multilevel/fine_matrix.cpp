@@ -2,11 +2,11 @@
 
 #include "plan/mesh/rest_shape.h"
 #include "plan/mesh/stencils.h"
-#include "threads/team.h"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <numeric>
 #include <span>
 #include <utility>
 
@@ -14,128 +14,142 @@ namespace pd {
 
 namespace {
 
-// Elements around each internal vertex.
-BlockMatrix incidence(const MultilevelScene& s, const std::vector<std::int32_t>& internal) {
-  const std::int64_t count = s.elements.count();
-  BlockMatrix corners{1, 1, std::int32_t(count), std::int32_t(s.elements.vertices), {0}, {}, {}};
-  for (std::int64_t e = 0; e < count; ++e) {
-    const std::size_t first = corners.column.size();
-    for (const std::int64_t v : s.elements.corners(e)) {
-      const auto own = corners.column.begin() + std::ptrdiff_t(first);
-      // a corner without a share may repeat another
-      if (std::find(own, corners.column.end(), internal[v]) == corners.column.end())
-        corners.column.push_back(internal[v]);
-    }
-    corners.start.push_back(std::int32_t(corners.column.size()));
-  }
-  corners.value.resize(corners.column.size());
-  return transpose(corners).matrix;
-}
-
-// One element: its vectors g_a, their measure and l_e.
-struct Element {
-  std::array<std::array<double, 3>, 5> gradient{};
-  double measure, bound;
+// Elements around each internal vertex, ascending.
+struct Incidence {
+  std::vector<std::int64_t> start;
+  std::vector<std::int32_t> element;
 };
 
-Element tetrahedron(const MeshElements& elements, std::span<const std::int64_t> corner) {
-  const Rest rest = rest_of(elements.positions, {corner[0], corner[1], corner[2], corner[3]});
-  Element made{{}, rest.volume, rest.bound};
-  for (int c = 0; c < 3; ++c) {
-    for (int k = 1; k < 4; ++k) {
-      made.gradient[k][c] = rest.inverse[3 * (k - 1) + c];
-      made.gradient[0][c] -= made.gradient[k][c];
+Incidence incidence(const MeshElements& elements, const std::vector<std::int32_t>& internal) {
+  // a corner without a share may repeat another
+  const auto for_corners = [&](auto work) {
+    for (std::int64_t e = 0; e < elements.count(); ++e) {
+      const std::span<const std::int64_t> corners = elements.corners(e);
+      for (auto v = corners.begin(); v != corners.end(); ++v) {
+        if (std::find(corners.begin(), v, *v) == v) work(e, internal[*v]);
+      }
     }
-  }
+  };
+  Incidence around{std::vector<std::int64_t>(internal.size() + 1, 0), {}};
+  for_corners([&](std::int64_t, std::int32_t v) { ++around.start[v + 1]; });
+  std::partial_sum(around.start.begin(), around.start.end(), around.start.begin());
+  around.element.resize(around.start.back());
+  std::vector<std::int64_t> next(around.start.begin(), around.start.end() - 1);
+  for_corners([&](std::int64_t e, std::int32_t v) { around.element[next[v]++] = std::int32_t(e); });
+  return around;
+}
+
+// One element: its vectors g_a and their measure.
+struct Element {
+  std::array<std::array<double, 3>, 5> gradient{};
+  double measure;
+};
+
+Element tetrahedron(const MeshElements& elements, std::int64_t tet) {
+  const RestShape rest = rest_shape(elements.positions, elements.tet(tet));
+  Element made{{}, rest.volume};
+  std::ranges::copy(rest.gradients(), made.gradient.begin());
   return made;
+}
+
+// The stencil of an element that is no tetrahedron: its group, and its number there.
+std::pair<const StencilGroup*, std::int64_t> stencil_at(const MeshElements& elements,
+                                                        std::int64_t element) {
+  element -= elements.tet_count;
+  const StencilGroup* group = elements.groups.data();
+  while (element >= group->count) element -= (group++)->count;
+  return {group, element};
 }
 
 Element stencil(const MeshElements& elements, std::int64_t element) {
-  element -= elements.tet_count;
-  std::size_t g = 0;
-  while (element >= elements.groups[g].count) element -= elements.groups[g++].count;
-  const StencilGroup& group = elements.groups[g];
-  Element made{{}, group.measure[element], stencil_bound(group, element)};
-  for (int k = 0; k < group.corners; ++k) {
-    for (int c = 0; c < group.dims; ++c)
-      made.gradient[k][c] = group.gradient[(element * group.corners + k) * group.dims + c];
+  const auto [group, s] = stencil_at(elements, element);
+  Element made{{}, group->measure[s]};
+  for (int k = 0; k < group->corners; ++k) {
+    for (int c = 0; c < group->dims; ++c)
+      made.gradient[k][c] = group->gradient[(s * group->corners + k) * group->dims + c];
   }
   return made;
 }
 
-// One row of A: inertia, plus w V g_i . g_j of every adjacent element.
-struct Row {
-  std::vector<std::pair<std::int32_t, double>> entry;
-  double bound = 0;
-};
+// l_e of every element.
+std::vector<double> bounds(const MeshElements& elements, int threads) {
+  std::vector<double> bound(elements.count());
+  constexpr std::int64_t several = bound_lanes;
+  for_rows((elements.tet_count + several - 1) / several, threads, [&](std::int64_t number) {
+    const std::int64_t first = several * number, last = elements.tet_count - 1;
+    std::array<RestShape, bound_lanes> shapes;
+    for (std::int64_t i = 0; i < several; ++i)
+      shapes[i] = rest_shape(elements.positions, elements.tet(std::min(first + i, last)));
+    const std::array<double, bound_lanes> found = tet_bounds(shapes);
+    std::copy_n(found.begin(), std::min(several, elements.tet_count - first),
+                bound.begin() + first);
+  });
+  for (std::int64_t e = elements.tet_count; e < elements.count(); ++e) {
+    const auto [group, s] = stencil_at(elements, e);
+    bound[e] = stencil_bound(*group, s);
+  }
+  return bound;
+}
 
-void assemble_row(const MultilevelScene& s, const std::vector<std::int32_t>& internal,
-                  const BlockMatrix& around, const Mask& held, std::int32_t i, Row& row) {
-  row.entry.clear();
-  row.bound = s.inertia[s.vertex_order[i]];
-  row.entry.emplace_back(i, row.bound);
-  for (std::int32_t p = around.start[i]; p < around.start[i + 1]; ++p) {
-    const std::int64_t e = around.column[p];
-    const std::span<const std::int64_t> corner = s.elements.corners(e);
-    const Element element =
-        e < s.elements.tet_count ? tetrahedron(s.elements, corner) : stencil(s.elements, e);
-    const auto& gradient = element.gradient;
-    const double weight = s.stiffness[e] * element.measure;
-    // a vertex without a share may repeat another corner, and then stands twice
-    for (std::size_t own = 0; own < corner.size(); ++own) {
-      if (internal[corner[own]] != i) continue;
-      for (std::size_t k = 0; k < corner.size(); ++k) {
-        double dot = 0;
-        for (int c = 0; c < 3; ++c) dot += gradient[own][c] * gradient[k][c];
-        if (k == own) row.bound += element.bound * weight * dot;
-        if (!held[internal[corner[k]]]) row.entry.emplace_back(internal[corner[k]], weight * dot);
+class Assembly {
+ public:
+  Assembly(const MultilevelScene& scene, int threads)
+      : scene_(scene),
+        internal_(scene.elements.vertices),
+        held_(internal_.size()),
+        bound_(bounds(scene.elements, threads)) {
+    for (std::size_t i = 0; i < internal_.size(); ++i) {
+      internal_[scene.vertex_order[i]] = std::int32_t(i);
+      held_[i] = !std::isfinite(scene.inertia[scene.vertex_order[i]]);
+    }
+    around_ = incidence(scene.elements, internal_);
+  }
+
+  const Mask& held() const { return held_; }
+
+  // Row `i` of A: inertia, plus w V g_i . g_j of every adjacent element. Returns its weighted diagonal.
+  double fill(std::int32_t i, RowSum& row) const {
+    if (held_[i]) return 0;
+    double weighted = scene_.inertia[scene_.vertex_order[i]];
+    *row.at(i) += weighted;
+    for (std::int64_t p = around_.start[i]; p < around_.start[i + 1]; ++p) {
+      const std::int64_t e = around_.element[p];
+      const std::span<const std::int64_t> corner = scene_.elements.corners(e);
+      const auto& [gradient, measure] = e < scene_.elements.tet_count
+                                            ? tetrahedron(scene_.elements, e)
+                                            : stencil(scene_.elements, e);
+      const double weight = scene_.stiffness[e] * measure;
+      // a vertex without a share may repeat another corner, and then stands twice
+      for (std::size_t own = 0; own < corner.size(); ++own) {
+        if (internal_[corner[own]] != i) continue;
+        for (std::size_t k = 0; k < corner.size(); ++k) {
+          double dot = 0;
+          for (int c = 0; c < 3; ++c) dot += gradient[own][c] * gradient[k][c];
+          if (k == own) weighted += bound_[e] * weight * dot;
+          const std::int32_t column = internal_[corner[k]];
+          if (!held_[column]) *row.at(column) += weight * dot;
+        }
       }
     }
+    return weighted;
   }
-  // equal columns stay in the order of their tetrahedra, so that sums do not depend on the sort
-  std::stable_sort(row.entry.begin(), row.entry.end(),
-                   [](const auto& a, const auto& b) { return a.first < b.first; });
-}
+
+ private:
+  const MultilevelScene& scene_;
+  std::vector<std::int32_t> internal_;  // user's number -> internal number
+  Mask held_;
+  std::vector<double> bound_;
+  Incidence around_;
+};
 
 }  // namespace
 
-FineMatrix assemble(const MultilevelScene& s, int threads) {
-  const std::int32_t n = std::int32_t(s.elements.vertices);
-  FineMatrix fine{{1, 1, n, n, {0}, {}, {}}, std::vector<double>(n, 0.0), Mask(n, 0)};
-  std::vector<std::int32_t> internal(n);
-  for (std::int32_t i = 0; i < n; ++i) {
-    internal[s.vertex_order[i]] = i;
-    fine.held[i] = !std::isfinite(s.inertia[s.vertex_order[i]]);
-  }
-  const BlockMatrix around = incidence(s, internal);
-  std::vector<BlockMatrix> parts(threads);
-  run_team(threads, [&](const Team& team) {
-    BlockMatrix& part = parts[team.rank];
-    Row row;
-    for (std::int64_t i = team.begin(n); i < team.end(n); ++i) {
-      if (!fine.held[i]) {
-        assemble_row(s, internal, around, fine.held, std::int32_t(i), row);
-        fine.bound[i] = row.bound;
-        const std::size_t first = part.column.size();
-        for (const auto& [column, value] : row.entry) {
-          if (part.column.size() > first && part.column.back() == column) {
-            part.value.back() += value;
-          } else {
-            part.column.push_back(column);
-            part.value.push_back(value);
-          }
-        }
-      }
-      part.start.push_back(std::int32_t(part.column.size()));
-    }
-  });
-  for (const BlockMatrix& part : parts) {
-    const std::int32_t before = fine.matrix.start.back();
-    for (std::size_t i = 1; i < part.start.size(); ++i)
-      fine.matrix.start.push_back(before + part.start[i]);
-    fine.matrix.column.insert(fine.matrix.column.end(), part.column.begin(), part.column.end());
-    fine.matrix.value.insert(fine.matrix.value.end(), part.value.begin(), part.value.end());
-  }
+FineMatrix assemble(const MultilevelScene& scene, int threads) {
+  const std::int32_t n = std::int32_t(scene.elements.vertices);
+  const Assembly rows(scene, threads);
+  FineMatrix fine{{1, 1, n, n, {}, {}, {}}, std::vector<double>(n), rows.held()};
+  sum_rows(fine.matrix, -0.0, threads,
+           [&](std::int32_t row, RowSum& sum) { fine.bound[row] = rows.fill(row, sum); });
   return fine;
 }
 

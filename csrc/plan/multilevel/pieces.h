@@ -19,7 +19,8 @@ struct Pieces {
 
 // Compact pieces by Lloyd's method on the coupling graph, 2 n^(1/3) for n free vertices. Jacobi sweeps on the elastic
 // part of A smooth their weights, so that pieces bend into each other. `inertia`: of each vertex [N/m]
-Pieces cut_pieces(const FineMatrix& fine, const Graph& graph, const std::vector<double>& inertia);
+Pieces cut_pieces(const FineMatrix& fine, const Graph& graph, const std::vector<double>& inertia,
+                  int threads);
 
 // Aggregates joined by their numbers until there are at most so many.
 Aggregates limited(Aggregates groups, std::int32_t most);
