@@ -41,6 +41,14 @@ def build_multilevel(
     threads: int,
     progress: Callable[[float], None],
 ) -> dict[str, NDArray[Any]]: ...
+def list_pieces(
+    pieces: int,
+    piece_of: NDArray[int32],
+    piece_weight: NDArray[float64],
+    fine_start: NDArray[int32],
+    fine_column: NDArray[int32],
+    corners: NDArray[int32],
+) -> dict[str, NDArray[int32]]: ...
 def plan_table() -> list[tuple[str, str, int, str, str]]: ...
 def stencil_table() -> list[tuple[str, str, int, str, str]]: ...
 def kind_table() -> list[tuple[str, int, int, int, tuple[str, ...], str, int, bool]]: ...
@@ -77,7 +85,7 @@ def step_bytes(
 info_numbers: int
 slide_vectors: int
 outer_static_bytes: int
-corotation_bytes: int
+pieces_bytes: int
 outlier_ratio: float
 adjoint_tolerance: tuple[float, float]
 adjoint_failed: float

@@ -6,6 +6,7 @@
 #include "plan/cpu/build.h"
 #include "plan/gpu/build.h"
 #include "plan/multilevel/build.h"
+#include "plan/multilevel/piece_lists.h"
 #include "views/shared_memory.h"
 
 #include <pybind11/functional.h>
@@ -18,6 +19,7 @@
 #include <functional>
 #include <map>
 #include <optional>
+#include <span>
 #include <string>
 #include <utility>
 #include <vector>
@@ -279,6 +281,27 @@ inline py::dict build_multilevel(const Doubles& positions, const Indices& tets,
 #define X(name, type, width, rows, meaning) arrays[#name] = as_array(tables.name, width);
 #include "views/multilevel.def"
 #undef X
+  return arrays;
+}
+
+// What a GPU sums up by pairs of pieces, of a preconditioner's arrays and the corners of tetrahedra in the plan's order.
+inline py::dict list_pieces(int pieces, const Numbers& of, const Doubles& weight,
+                            const Numbers& fine_start, const Numbers& fine_column,
+                            const Numbers& corners) {
+  const auto span = [](const auto& array) {
+    return std::span(array.data(), std::size_t(array.size()));
+  };
+  pd::PieceLists lists = pd::list_pieces({pieces, span(of), span(weight), span(fine_start),
+                                                span(fine_column), span(corners)});
+  py::dict arrays;
+  const auto add = [&](const char* name, pd::PairList& list) {
+    const std::string of_kind = std::string("piece_") + name;
+    arrays[(of_kind + "_start").c_str()] = as_array(list.start, 1);
+    arrays[(of_kind + "_task").c_str()] = as_array(list.task, 4);
+    arrays[of_kind.c_str()] = as_array(list.item, 1);
+  };
+  add("row", lists.rows);
+  add("tet", lists.tets);
   return arrays;
 }
 

@@ -125,6 +125,8 @@ PYBIND11_MODULE(_C, m) {
   m.def("build_multilevel", &build_multilevel, py::arg("positions"), py::arg("tets"),
         py::arg("stencils"), py::arg("vertex_order"), py::arg("stiffness"), py::arg("inertia"),
         py::arg("most_direct"), py::arg("folded"), py::arg("threads"), py::arg("progress"));
+  m.def("list_pieces", &list_pieces, py::arg("pieces"), py::arg("piece_of"),
+        py::arg("piece_weight"), py::arg("fine_start"), py::arg("fine_column"), py::arg("corners"));
   m.def(
       "plan_table", [] { return table(plan_rows); },
       "Rows (name, type, width, rows, meaning) of the constant arrays, in op order.");
@@ -202,7 +204,7 @@ PYBIND11_MODULE(_C, m) {
       "Memory that the current CUDA device wants for a step; level_sizes: none without a "
       "preconditioner; stencil_sizes, row_sizes: none without stencils.");
   m.attr("outer_static_bytes") = pd::outer_static_bytes;
-  m.attr("corotation_bytes") = pd::corotation_bytes;
+  m.attr("pieces_bytes") = pd::pieces_bytes;
   m.attr("outlier_ratio") = pd::outlier_ratio;
   m.attr("adjoint_tolerance") =
       std::make_pair(pd::adjoint_tolerance<float>, pd::adjoint_tolerance<double>);

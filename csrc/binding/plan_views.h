@@ -46,7 +46,8 @@ constexpr int level_arrays = 0
 
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
-  std::int64_t level_size, element, vertex, device_vertex, piece_pack, fine_end, fine_entry,
+  std::int64_t level_size, element, vertex, piece_pack, piece_pair_end, piece_row_task, piece_row,
+      piece_tet_task, piece_tet, fine_end, fine_entry,
       fine_prolongation, host_fine_prolongation, device_fine_prolongation, fine_node_end,
       middle_end, middle_entry, middle, middle_prolongation, host_middle_prolongation,
       device_middle_prolongation, middle_node_end, coarse_entry, device_coarse_entry;
@@ -134,8 +135,12 @@ Levels<T> levels_view(at::TensorList arrays, int first, int vertices, std::int64
   count.middle_node_end = middle ? levels.middle_nodes + 1 : 0;
   count.coarse_entry = coarse * (coarse + 1) / 2;
   count.piece_pack = levels.piece_packs;
+  count.piece_row_task = levels.piece_row_tasks;
+  count.piece_row = size[level_piece_rows];
+  count.piece_tet_task = levels.piece_tet_tasks;
+  count.piece_tet = size[level_piece_tets];
   const bool on_device = place.device.is_cuda();
-  count.device_vertex = on_device ? vertices : 0;
+  count.piece_pair_end = on_device ? levels.pieces * (levels.pieces + 1) / 2 + 1 : 0;
   (on_device ? count.device_fine_prolongation : count.host_fine_prolongation) =
       count.fine_prolongation;
   (on_device ? count.device_middle_prolongation : count.host_middle_prolongation) =

@@ -102,19 +102,19 @@ constexpr std::size_t pipeline_half_bytes(std::size_t real, std::size_t slots,
   return slots_bytes(real, slots, 2) + aligned(3 * real * entries);
 }
 
-// Memory of the multilevel solver's coarse problem, and the least scratch memory while it is built. Tetrahedra with
-// so many numbers are faster with more.
-constexpr std::size_t corotation_bytes = 11264;
-constexpr std::size_t turning_tile_numbers = 49;
-constexpr std::size_t turning_scratch_bytes = 4 * 24 * 24 * sizeof(double);
-constexpr std::size_t corotation_begin(std::size_t pass_bytes, std::size_t scratch_bytes) {
-  return aligned(pass_bytes < scratch_bytes ? scratch_bytes : pass_bytes);
+// Memory of the multilevel solver's coarse space, which follows that of a pass. While it is made, warps use the latter,
+// up to 16 of them.
+constexpr std::size_t pieces_bytes = 11264;
+constexpr std::size_t piece_scratch_numbers = 32;
+constexpr std::size_t pieces_offset(std::size_t pass_bytes) {
+  constexpr std::size_t scratch = 16 * piece_scratch_numbers * sizeof(double);
+  return aligned(pass_bytes < scratch ? scratch : pass_bytes);
 }
 
 // shared memory of a block, with a plan for the multilevel solver
 constexpr std::size_t outer_shared_bytes(std::size_t real, std::size_t slots, std::size_t entries) {
-  return corotation_begin(pass_shared_bytes(real, slots, entries, 2), turning_scratch_bytes) +
-         corotation_bytes + outer_static_bytes;
+  return pieces_offset(pass_shared_bytes(real, slots, entries, 2)) + pieces_bytes +
+         outer_static_bytes;
 }
 
 }  // namespace pd

@@ -37,6 +37,10 @@ enum LevelSize : int {
   level_direct,        // 1: no levels, A itself is solved directly
   level_pieces,        // of the coarse space of L-BFGS
   level_piece_packs,   // of tetrahedra that the same pieces move; 0 on a GPU
+  level_piece_row_tasks,  // on a GPU: for sums of pairs of pieces over rows of A, and their rows
+  level_piece_rows,
+  level_piece_tet_tasks,  // the same over tetrahedra
+  level_piece_tets,
   level_size_count
 };
 
@@ -48,6 +52,7 @@ struct Levels {
 #include "views/multilevel.def"
 #undef X
   int vertices = 0, fine_nodes = 0, middle_nodes = 0, pieces = 0, piece_packs = 0;
+  int piece_row_tasks = 0, piece_tet_tasks = 0;
   bool direct = false;
 
   PD_HD bool there() const { return fine_start != nullptr; }
@@ -67,6 +72,8 @@ Levels<T> count_levels(const int32* sizes, int vertices) {
   levels.direct = sizes[level_direct] != 0;
   levels.pieces = sizes[level_pieces];
   levels.piece_packs = sizes[level_piece_packs];
+  levels.piece_row_tasks = sizes[level_piece_row_tasks];
+  levels.piece_tet_tasks = sizes[level_piece_tet_tasks];
   return levels;
 }
 

@@ -124,7 +124,7 @@ def pieces_of(plan: Plan) -> Pieces:
     order, of = plan.vertex_order.numpy(), plan.piece_of.numpy().reshape(-1, 4)
     weight = plan.piece_weight.numpy().astype(np.float64).reshape(-1, 4)
     entries = (weight.ravel(), (np.repeat(order, 4), of.ravel()))
-    shares = csr_array(entries, shape=(len(order), int(plan.level_sizes[-2])))
+    shares = csr_array(entries, shape=(len(order), int(plan.level_sizes[7])))
     shares.eliminate_zeros()
     main = np.empty(len(order), np.int64)
     main[order] = np.where(weight[:, 0] > 0.0, of[:, 0], -1)

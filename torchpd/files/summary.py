@@ -252,7 +252,7 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     if solver.outer == "momentum":
         return real * numbers
     # the coarse space: two vectors, and two dense matrices of all pieces
-    pieces = int(plan.level_sizes[-2])
+    pieces = int(plan.level_sizes[7])
     return real * (numbers + 8 * plan.vertices) + 8 * 2 * (_MODES * pieces) ** 2
 
 

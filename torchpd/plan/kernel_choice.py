@@ -170,7 +170,7 @@ class _PlanBuilder(NamedTuple):
                 return 1
             # estimate: 2.5 entries and a third of a slot per tetrahedron, see pass_shared_bytes
             each = (4 * 2.5 + 6 / 3) * self.real
-            least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.corotation_bytes))
+            least = -(-self.tets * each // (gpu.shared - _C.outer_static_bytes - _C.pieces_bytes))
             if kernel == "many":
                 return max(2, int(least), -(-self.tets // _MANY_TETS))
             rounds = -(-int(least) // gpu.multiprocessors)

@@ -124,6 +124,7 @@ def precondition_plan(
         )  # fmt: skip
     if plan.kernel is not None:
         arrays["coarse_columns"] = _by_columns(arrays["coarse_factor"])
+        arrays |= _list_pieces(plan, values, arrays)
     else:
         arrays |= _pack_tets(plan, arrays)
     levels = (
@@ -145,6 +146,28 @@ def _by_columns(packed: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 _LANES = 16  # of a pack, as in csrc/views/multilevel.def
+# places in level_sizes, as in csrc/views/views.h
+_PIECES, _PACKS, _LISTS = 7, 8, slice(9, 13)
+_PAIR_LANES = 32  # as in csrc/views/gpu_plan.def
+
+
+def _list_pieces(plan: Plan, values: SceneValues, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Rows of A and tetrahedra by pairs of pieces, for a GPU; tetrahedra by their places in the plan."""
+    tets = plan.pair_tet.cpu().numpy().reshape(-1, 2, _PAIR_LANES).swapaxes(1, 2).reshape(-1)
+    place = np.flatnonzero(tets >= 0).astype(np.int32)
+    internal = np.empty(len(plan.vertex_order), np.int32)
+    internal[plan.vertex_order.cpu().numpy()] = np.arange(len(internal), dtype=np.int32)
+    lists = _C.list_pieces(
+        int(arrays["level_sizes"][_PIECES]), arrays["piece_of"], arrays["piece_weight"], arrays["fine_start"],
+        arrays["fine_column"], internal[values.tets[tets[place]]],
+    )  # fmt: skip
+    blocks = np.diff(plan.patch_block.cpu().numpy())
+    patch = np.repeat(np.arange(len(blocks), dtype=np.int32), blocks)
+    found = place[lists["piece_tet"]]
+    lists["piece_tet"] = np.stack([found, patch[found // (2 * _PAIR_LANES)]], axis=1)
+    sizes = arrays["level_sizes"].copy()
+    sizes[_LISTS] = [len(lists[name]) for name in ("piece_row_task", "piece_row", "piece_tet_task", "piece_tet")]
+    return {**lists, "level_sizes": sizes}
 
 
 def _pack_tets(plan: Plan, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
@@ -164,6 +187,6 @@ def _pack_tets(plan: Plan, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray
     tets = np.full(_LANES * int(packs.sum()), -1, np.int32)
     tets[first[own] + np.arange(len(own)) - (np.cumsum(counts) - counts)[own]] = place
     sizes = arrays["level_sizes"].copy()
-    sizes[-1] = packs.sum()
+    sizes[_PACKS] = packs.sum()
     patches = np.repeat(np.arange(len(packs), dtype=np.int32), packs)
     return {"level_sizes": sizes, "piece_pack_patch": patches, "piece_pack_tet": tets.reshape(-1, _LANES)}

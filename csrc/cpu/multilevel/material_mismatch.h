@@ -16,7 +16,7 @@ struct MismatchRunner {
   std::int64_t environment;
   T per_time;  // 1 / h
   const Team& team;
-  Range (*ranges)[ranges_count];  // one row a thread
+  RatioRange (*ranges)[ranges_count];  // one row a thread
   Inertia inertia;
 
   template <class Visit>
@@ -34,7 +34,7 @@ struct MismatchRunner {
       visit(i, inertia(i));
   }
 
-  void reduce(Range (&range)[ranges_count]) const {
+  void reduce(RatioRange (&range)[ranges_count]) const {
     for (int n = 0; n < ranges_count; ++n) ranges[team.rank][n] = range[n];
     team.barrier();
     for (int rank = 0; rank < team.size; ++rank) {

@@ -137,27 +137,14 @@ class PieceElements {
     }
   }
 
-  // Of six numbers of a strain half are none.
   template <bool Dilates>
   void add_strains(const PieceStrain<R>* strains, int pieces, const R& weight, const R& pressure) {
     for (int k = 0; k < pieces; ++k) {
       const PieceStrain<R> stress = strains[k].template stressed<Dilates>(weight, pressure);
       for (int l = 0; l <= k; ++l) {
-        R* to = &slots_.sums[std::int64_t(piece_pair(rank_[k], rank_[l])) * piece_block];
-        PD_UNROLL
-        for (int i = 0; i < piece_modes; ++i) {
-          PD_UNROLL
-          for (int j = 0; j < piece_modes; ++j) {
-            R sum = to[piece_modes * i + j];
-            PD_UNROLL
-            for (int c = 0; c < PieceStrain<R>::numbers; ++c) {
-              const bool moves = strain_moves(i, c) || (Dilates && c < 3);
-              if (moves && strain_moves(j, c))
-                sum = multiply_add(stress.h[i][c], strains[l].h[j][c], sum);
-            }
-            to[piece_modes * i + j] = sum;
-          }
-        }
+        add_strain_products<Dilates>(
+            stress, strains[l],
+            &slots_.sums[std::int64_t(piece_pair(rank_[k], rank_[l])) * piece_block]);
       }
     }
   }

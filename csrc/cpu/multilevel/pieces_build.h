@@ -227,11 +227,11 @@ class PiecesMaker {
     }
   }
 
-  static void add_block(DenseFactor& to, int p, int q,
-                        const double (&block)[piece_modes][piece_modes]) {
+  template <class Entry>
+  static void add_block(DenseFactor& to, int p, int q, const Entry& entry) {
     for (int i = 0; i < piece_modes; ++i) {
       for (int j = 0; j < (p == q ? i + 1 : piece_modes); ++j)
-        to.at(piece_modes * p + i, piece_modes * q + j) += block[i][j];
+        to.at(piece_modes * p + i, piece_modes * q + j) += entry(i, j);
     }
   }
 
@@ -240,11 +240,8 @@ class PiecesMaker {
     f.energy.clear();
     f.matrix.clear();
     each_block(work_.chunks, work_.moments, [&](int p, int q, const Moments& moments) {
-      double block[piece_modes][piece_modes];
-      rigid_block(moments.matrix, block);
-      add_block(f.matrix, p, q, block);
-      rigid_block(moments.inertia, block);
-      add_block(f.energy, p, q, block);
+      add_block(f.matrix, p, q, [&](int i, int j) { return rigid_entry(moments.matrix, i, j); });
+      add_block(f.energy, p, q, [&](int i, int j) { return rigid_entry(moments.inertia, i, j); });
     });
     add_blocks(f.energy, work_.patches, work_.strains);
     for (int i = 0; i < work_.unknowns; ++i)
@@ -258,9 +255,7 @@ class PiecesMaker {
 
   static void add_blocks(DenseFactor& to, const PieceParts& parts, const Row<Block>& blocks) {
     each_block(parts, blocks, [&](int p, int q, const Block& own) {
-      double block[piece_modes][piece_modes];
-      std::copy_n(own.at, piece_block, &block[0][0]);
-      add_block(to, p, q, block);
+      add_block(to, p, q, [&](int i, int j) { return own.at[piece_modes * i + j]; });
     });
   }
 
@@ -309,18 +304,11 @@ class PiecesMaker {
                  (a == 2) - Work::number(row.z, lane)};
     }
     const Four arm = centred(arm_of(i, lane), piece, lane);
-    const double x = arm.v[1], y = arm.v[2], z = arm.v[3];
-    const Vec3<double> moved[piece_modes] = {{1, 0, 0},  {0, 1, 0},  {0, 0, 1},
-                                             {0, -z, y}, {z, 0, -x}, {-y, x, 0}};
-    for (int m = 0; m < piece_modes; ++m)
-      mode[m] = {weight * dot(held[0], moved[m]), weight * dot(held[1], moved[m]),
-                 weight * dot(held[2], moved[m])};
-  }
-
-  // a projector has less than this trace where it takes anything
-  static bool leaves_all(const Mat3<Real>& free) {
-    const Real trace = (free.row[0].x + free.row[1].y) + free.row[2].z;
-    return !any(trace < Real(T(2.5)));
+    for (int m = 0; m < piece_modes; ++m) {
+      const Vec3<double> moved = rigid_motion(m, Vec3<double>{arm.v[1], arm.v[2], arm.v[3]});
+      mode[m] = {weight * dot(held[0], moved), weight * dot(held[1], moved),
+                 weight * dot(held[2], moved)};
+    }
   }
 
   void factorise_held(int lane) const {

@@ -26,7 +26,7 @@ struct MultilevelWork {
   // [vertices] dE/du without the contacts' reaction, and friction; null without contacts
   Value *gradient, *trial_gradient, *friction, *trial_friction;
   Wide (*sums)[dots];             // [chunks]
-  Range (*ranges)[ranges_count];  // [threads] ratios of the material to that of M
+  RatioRange (*ranges)[ranges_count];  // [threads] ratios of the material to that of M
   int chunks;
 
   MultilevelWork(const StepCall<typename Lanes::Scalar>& call, bool has_contacts, int threads)
@@ -50,7 +50,7 @@ struct MultilevelWork {
       *field = place<Value>(at, held);
     for (Mat3<Real>** field : {&free, &trial_free}) *field = place<Mat3<Real>>(at, held);
     sums = place<Wide[dots]>(at, chunks);
-    ranges = place<Range[ranges_count]>(at, threads);
+    ranges = place<RatioRange[ranges_count]>(at, threads);
   }
 
  private:

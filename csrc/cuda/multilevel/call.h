@@ -1,7 +1,7 @@
 // Arguments and memory layout of the multilevel kernel.
 #pragma once
-#include "cuda/multilevel/deflation.h"
 #include "cuda/multilevel/lbfgs_pairs.h"
+#include "cuda/multilevel/pieces.h"
 #include "cuda/multilevel/v_cycle.h"
 #include "cuda/stream/kernels.h"
 
@@ -16,7 +16,7 @@ constexpr int dots_energy = 0, dots_sy = 2, dots_sg = dots_sy + history;
 constexpr int dots_s_residual = dots_sg + history, dots_change = dots_s_residual + 1;
 constexpr int dots_displacement = dots_change + 1, dots_yy = dots_displacement + 1;
 constexpr int dots_free_change = dots_yy + 1, trial_dots = dots_free_change + 1;
-constexpr int most_sums = trial_dots > turning_modes ? trial_dots : turning_modes;  // of any pass
+constexpr int most_sums = trial_dots;  // of any pass
 constexpr int most_chunks = 640;  // whose sums every block reduces
 // Threads per block. A block has a multiprocessor to itself; for meshes of one patch, two blocks
 // share one. Each thread has enough registers for all of its loads in flight.
@@ -32,10 +32,10 @@ struct MultilevelMemory {
   Mat3<T>*free, *trial_free;  // [teams, vertices], with contacts, as are the next four
   Quad<T>*gradient, *trial_gradient, *friction, *trial_friction;
   CycleMemory<T> cycle;            // [teams, ...]
-  CorotationMemory<T> corotation;  // [teams, ...], with a coarse problem
+  PiecesMemory<T> pieces;          // [teams, ...], with a coarse space
   double* chunk_dots;              // [teams, 2, most_sums, chunks], double-buffered
   double* patch_sums;              // [teams, patches, sums_count]
-  Range* ranges;                   // [teams, 2, blocks, ranges_count], double-buffered
+  RatioRange* ranges;                   // [teams, 2, blocks, ranges_count], double-buffered
   MaterialMismatch* mismatch;      // [batch]
   unsigned* counter;               // [teams], zero at the launch
 };
@@ -46,7 +46,7 @@ struct MultilevelCall {
   MultilevelMemory<T> memory;
   int teams, blocks;         // blocks of a team
   std::size_t shared_cycle;  // offset of the cycle's fields in shared memory; 0: in device memory
-  std::size_t shared_corotation;  // offset of CorotationControl in shared memory; 0: none
+  std::size_t shared_pieces;  // offset of PiecesControl in shared memory; 0: none
 
   PD_HD const DevicePlan<T>& plan() const { return stream.step.plan; }
   // Warps per chunk of vertices, a divisor of the warps of a block. It is 1 for small blocks, since
@@ -78,7 +78,7 @@ struct MultilevelControl {
   bool accepted, done;
 };
 
-// The arrays of one team.
+// The arrays of one team, but for those of pieces.
 template <class T>
 PD_DEVICE MultilevelMemory<T> of_team(const MultilevelCall<T>& call, int team) {
   MultilevelMemory<T> m = call.memory;
@@ -91,14 +91,6 @@ PD_DEVICE MultilevelMemory<T> of_team(const MultilevelCall<T>& call, int team) {
   m.free += at;
   m.trial_free += at;
   m.cycle = cycle_of_team(call.plan().levels, m.cycle, team);
-  CorotationMemory<T>& c = m.corotation;
-  c.arm += at;
-  c.numbers += turning_groups * at;
-  c.images += turning_groups * at;
-  c.products += std::int64_t(team) * turning_chunks(int(n)) * 2 * turning_products;
-  c.strains += std::int64_t(team) * call.plan().patches * turning_pairs;
-  c.totals += std::int64_t(team) * turning_totals;
-  c.springs += std::int64_t(team) * turning_chunks(int(n)) * turning_entries;
   m.chunk_dots += std::int64_t(team) * 2 * call.chunks() * most_sums;
   m.patch_sums += std::int64_t(team) * call.plan().patches * sums_count;
   m.ranges += std::int64_t(team) * 2 * call.blocks * ranges_count;

@@ -9,8 +9,8 @@ namespace pd::inline PD_TARGET {
 // the diagonal instead.
 template <class T, bool HasContacts, int Threads>
 PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::precondition() {
-  if (corotates_) corotate();
-  const double scale = c_.outer.weight(w_.settings().relaxation, has_contact_springs());
+  if (has_space_) find_space();
+  const double scale = c_.outer.weight(w_.settings().relaxation, is_held());
   const auto right_side = [&](int i) {
     Vec3<T> q = restricted(i, vec3(residual_[i]));
     if (lbfgs_) {
@@ -24,54 +24,41 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::precondition() {
     }
     return T(scale) * q;
   };
-  // If vertices are held that M leaves free, the coarse problem deflates the right-hand side before
-  // the cycle and corrects the result after it.
-  const bool deflates = corotated_ && !w_.plan.levels.direct && (HasContacts || outliers_.some);
-  if (corotated_) {
-    pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
-      const Vec3<T> q = right_side(i);
-      cycle_.set(i, q);
-      corotation_.multiply_modes(i, q, sum);
-    });
-    corotation_.compute_modes(c_.total, deflates, scale);
-  } else {
-    each_vertex([&](int i) { cycle_.set(i, right_side(i)); });
-  }
+  each_vertex([&](int i) { cycle_.set(i, right_side(i)); });
+  // around M where vertices are held that it leaves free
+  const bool around = made_ && !w_.plan.levels.direct && (HasContacts || outliers_.some);
+  if (made_)
+    team_ = apply_pieces(pieces_, team_, around ? PiecesPart::before : PiecesPart::all,
+                         cycle_.right_sides(), scale);
+  if (around) team_ = hide_pieces(pieces_, m_.cycle, team_);
   // the last phase of the cycle can be fused with the pass that follows it
-  const bool separate_finish = deflates || !lbfgs_;
-  if (deflates)
-    each_vertex([&](int i) { cycle_.set(i, corotation_.deflated(i, cycle_.right_side(i))); });
+  const bool separate_finish = around || !lbfgs_;
   cycle_.run_but_last();
   if (separate_finish) cycle_.finish();
-  if (deflates) {
-    pass<turning_modes, T>([&](int i, T(&sum)[turning_modes]) {
-      corotation_.multiply_images(i, cycle_.result(i), sum);
-    });
-    corotation_.complete_modes(c_.total, scale);
+  if (around) {
+    team_ = multiply_result(pieces_, m_.cycle, team_);
+    team_ = apply_pieces(pieces_, team_, PiecesPart::after, pieces_.memory.field, scale);
   }
   if (lbfgs_) correct(!separate_finish);
 }
 
+// Makes the coarse space where the step needs it, at the iterate.
 template <class T, bool HasContacts, int Threads>
-PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::corotate() {
-  const TurningPlan plan(iteration_, builds_, c_.outer.restarts - restarts_at_build_, HasContacts,
-                         c_.outer.rebuilds_coarse());
-  const CorotationInput<T> in = {w_.v.x, w_.v.u, w_.v.target, iterate_, w_.weights};
-  if (plan.forget) corotated_ = false;
-  if (plan.make) {
-    ++builds_;
-    restarts_at_build_ = c_.outer.restarts;
-    corotated_ = true;
-    contacts_current_ = false;
-    team_ = make_corotation(in, m_.corotation, team_, shared_, call_.shared_corotation,
-                            c_.outer.scale, corotation_.with_plan(call_.plan()));
-    if (threadIdx.x == 0) c_.outer.path_since_coarse = 0;
+PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::find_space() {
+  const bool begins = iteration_ >= (HasContacts ? touching_pieces_begin : pieces_begin);
+  const PiecesInput<T> in = {w_.v.x, w_.v.u, w_.v.target, iterate_, w_.origin, w_.weights};
+  double* scratch = reinterpret_cast<double*>(shared_);
+  if (made_ ? c_.outer.is_outdated() : begins) {
+    made_ = true;
+    holds_ = false;
+    pieces_.begin(call_.plan(), call_.memory.pieces, int(blockIdx.x) / call_.blocks);
+    team_ = make_pieces(in, pieces_, team_, scratch, c_.outer.scale, HasContacts);
+    if (threadIdx.x == 0) c_.outer.rebuilt();
   }
   if constexpr (HasContacts) {
-    if (corotated_ && !contacts_current_)
-      team_ = hold_corotation(in, free_, m_.corotation, team_, shared_, c_.outer.scale,
-                              corotation_.control());
-    contacts_current_ = corotated_;
+    if (made_ && !holds_)
+      team_ = hold_pieces(in, free_, pieces_, team_, scratch, c_.outer.scale);
+    holds_ = made_;
   }
 }
 
@@ -83,8 +70,8 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::correct(bool last) {
     Vec3<T> y[history];
     load_pairs(m_.y, i, y);
     Vec3<T> z = cycle_.result(i);
-    if (corotated_) {
-      z = corotation_.corrected(i, z);
+    if (made_) {
+      z = z + moved(i);
       cycle_.set_result(i, z);
     }
 #pragma unroll

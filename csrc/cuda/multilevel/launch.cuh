@@ -37,7 +37,7 @@ __global__ void __launch_bounds__(multilevel_threads)
     compare_material(const __grid_constant__ MultilevelCall<T> call) {
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
-  Range* const ranges = of_team(call, number).ranges;
+  RatioRange* const ranges = of_team(call, number).ranges;
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
     const StreamWork<T, false> w(call.stream, e);
     const DeviceStep<T>& step = call.stream.step;
@@ -76,6 +76,12 @@ __global__ void __launch_bounds__(multilevel_threads)
   }
 }
 
+// Whether L-BFGS has a coarse space.
+template <class T>
+bool has_space(const DeviceStep<T>& step) {
+  return step.settings.learns() && step.plan.levels.pieces > 0;
+}
+
 template <class T>
 using MultilevelKernel = void (*)(MultilevelCall<T>);
 
@@ -83,14 +89,17 @@ template <class T>
 struct MultilevelLaunch {
   MultilevelKernel<T> kernel;
   int threads;
-  std::size_t shared, shared_cycle = 0, shared_corotation = 0;
+  std::size_t shared, shared_cycle = 0, shared_pieces = 0;
   int resident;
 
   explicit MultilevelLaunch(const DeviceStep<T>& step)
       : kernel(kernel_of(step)),
         threads(is_small(step) ? small_multilevel_threads : multilevel_threads),
         shared(pass_shared_bytes(sizeof(T), step.plan.most_slots, step.plan.most_entries, 2)) {
-    if (step.settings.learns()) add_corotation();
+    if (has_space(step)) {
+      shared_pieces = pieces_offset(shared);
+      shared = shared_pieces + pieces_bytes;
+    }
     resident = blocks_with(shared);
     keep_cycle(step);
     if (resident == 0) refuse_shared_memory(shared);
@@ -103,20 +112,6 @@ struct MultilevelLaunch {
     // the same teams compare the material
     return std::min(of(reinterpret_cast<const void*>(kernel), bytes),
                     of(reinterpret_cast<const void*>(compare_material<T>), 0));
-  }
-
-  // Reserves shared memory for the coarse problem, behind as much scratch memory as possible
-  // without fewer resident blocks.
-  void add_corotation() {
-    const auto begin = [&](std::size_t scratch) { return corotation_begin(shared, scratch); };
-    const auto blocks = [&](std::size_t scratch) {
-      return blocks_with(begin(scratch) + corotation_bytes);
-    };
-    std::size_t scratch = threads * turning_tile_numbers * sizeof(float);
-    const int most = std::max(blocks(turning_scratch_bytes), 1);
-    while (scratch > turning_scratch_bytes && blocks(scratch) < most) scratch /= 2;
-    shared_corotation = begin(std::max(scratch, turning_scratch_bytes));
-    shared = shared_corotation + corotation_bytes;
   }
 
   // Puts the fields of the cycle in shared memory if one block works on an environment and they
@@ -152,16 +147,30 @@ struct MultilevelLaunch {
     const int useful =
         std::max(plan.patches, spread ? useful_blocks(plan.levels, multilevel_threads) : 1);
     const Teams teams(stream.step.batch, resident, useful);
-    return {stream, {}, teams.count, teams.blocks, shared_cycle, shared_corotation};
+    return {stream, {}, teams.count, teams.blocks, shared_cycle, shared_pieces};
   }
 };
+
+template <class T>
+void arrange(Arena& arena, const Levels<T>& levels, std::int64_t teams, bool touching,
+             PiecesMemory<T>& m) {
+  const std::int64_t pieces = levels.pieces, unknowns = piece_modes * pieces;
+  const std::int64_t blocks = piece_pair(levels.pieces, 0) * piece_block;
+  for (Quad<T>** array : {&m.arm, &m.field}) arena.place(*array, teams * levels.vertices);
+  arena.place(m.centre, teams * pieces);
+  arena.place(m.row_sums, teams * levels.piece_row_tasks * piece_block);
+  arena.place(m.strains, teams * levels.piece_tet_tasks * piece_block);
+  for (double** array : {&m.mode, &m.scale}) arena.place(*array, teams * unknowns);
+  for (double*& block : m.block) arena.place(block, teams * blocks);
+  arena.place(m.unheld, touching ? teams * blocks : 0);
+  arena.place(m.panel, teams * 4 * pieces * piece_block);
+}
 
 template <class T>
 MultilevelMemory<T> arrange(Arena& arena, const MultilevelCall<T>& call) {
   const DeviceStep<T>& step = call.stream.step;
   const std::int64_t teams = call.teams, n = step.plan.vertices;
   const std::int64_t pairs = step.settings.learns() ? history * n : 0;
-  const std::int64_t small = step.settings.learns() ? teams : 0;
   const std::int64_t held = has_contacts(step) ? n : 0;
   MultilevelMemory<T> m;
   // zero-initialised arrays come first
@@ -173,13 +182,7 @@ MultilevelMemory<T> arrange(Arena& arena, const MultilevelCall<T>& call) {
   for (Quad<T>** array : {&m.gradient, &m.trial_gradient, &m.friction, &m.trial_friction})
     arena.place(*array, teams * held);
   arrange(arena, step.plan.levels, int(teams), m.cycle);
-  arena.place(m.corotation.arm, small * n);
-  for (Quad<T>** array : {&m.corotation.numbers, &m.corotation.images})
-    arena.place(*array, small * turning_groups * n);
-  arena.place(m.corotation.products, small * turning_chunks(int(n)) * 2 * turning_products);
-  arena.place(m.corotation.strains, small * step.plan.patches * turning_pairs);
-  arena.place(m.corotation.totals, small * turning_totals);
-  arena.place(m.corotation.springs, held ? small * turning_chunks(int(n)) * turning_entries : 0);
+  if (has_space(step)) arrange(arena, step.plan.levels, teams, held > 0, m.pieces);
   arena.place(m.chunk_dots, teams * 2 * call.chunks() * most_sums);
   arena.place(m.patch_sums, teams * step.plan.patches * sums_count);
   arena.place(m.ranges, teams * 2 * call.blocks * ranges_count);

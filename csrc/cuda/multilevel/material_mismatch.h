@@ -8,7 +8,7 @@ namespace pd::inline PD_TARGET {
 template <class T>
 class MismatchRunner {
  public:
-  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, const Moduli<T>& moduli, Range* memory,
+  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, const Moduli<T>& moduli, RatioRange* memory,
                            BlockTeam& team)
       : w_(w), moduli_(moduli), memory_(memory), team_(team) {}
 
@@ -31,7 +31,7 @@ class MismatchRunner {
       visit(i, double(w_.v.inertia(i)));
   }
 
-  PD_DEVICE void reduce(Range (&range)[ranges_count]) {
+  PD_DEVICE void reduce(RatioRange (&range)[ranges_count]) {
     __shared__ double least[ranges_count][warp_size], largest[ranges_count][warp_size];
     const int lane = threadIdx.x % warp_size, warp = threadIdx.x / warp_size;
     __syncthreads();  // the previous round has read the shared arrays
@@ -44,16 +44,16 @@ class MismatchRunner {
       }
     }
     __syncthreads();
-    Range* rows = memory_ + (round_++ & 1) * team_.blocks() * ranges_count;
+    RatioRange* rows = memory_ + (round_++ & 1) * team_.blocks() * ranges_count;
     if (threadIdx.x < ranges_count) {
-      Range own;
+      RatioRange own;
       for (int w = 0; w < int(blockDim.x) / warp_size; ++w)
         own.add({least[threadIdx.x][w], largest[threadIdx.x][w]});
       rows[team_.rank() * ranges_count + threadIdx.x] = own;
     }
     team_.barrier();
     for (int n = 0; n < ranges_count; ++n) {
-      Range all;
+      RatioRange all;
       for (int b = lane; b < team_.blocks(); b += warp_size) all.add(rows[b * ranges_count + n]);
       range[n] = {warp_reduce(all.least, Min{}), -warp_reduce(-all.largest, Min{})};
     }
@@ -62,7 +62,7 @@ class MismatchRunner {
  private:
   const StreamWork<T, false>& w_;
   Moduli<T> moduli_;
-  Range* memory_;
+  RatioRange* memory_;
   BlockTeam& team_;
   int round_ = 0;
 };

@@ -1,7 +1,8 @@
 // Runs solver/multilevel/lbfgs.h on a GPU: all iterations of one environment by a team of blocks; see
 // also cpu/multilevel/stepper.h. Other parts of a step are launches of their own, as in cuda/stream/kernels.h.
 #pragma once
-#include "cuda/multilevel/deflation_build.h"
+#include "cuda/multilevel/call.h"
+#include "cuda/multilevel/pieces_build.h"
 #include "cuda/stream/shared_vertices.h"
 #include "solver/multilevel/trial_vertex.h"
 
@@ -27,8 +28,8 @@ class MultilevelRunner {
                reinterpret_cast<Quad<T>*>(control.warp_dot)),
         shared_(shared),
         lbfgs_(call.stream.step.settings.learns()),
-        corotates_(call.shared_corotation > 0),
-        corotation_(call.plan().vertices, memory.corotation, shared + call.shared_corotation) {
+        has_space_(call.shared_pieces > 0),
+        pieces_(*reinterpret_cast<PiecesControl<T>*>(shared + call.shared_pieces)) {
     const MaterialMismatch& mismatch = m_.mismatch[environment];
     outliers_ = {mismatch.has_outliers, T(mismatch.trusted)};
     if (threadIdx.x == 0) {
@@ -90,7 +91,7 @@ class MultilevelRunner {
     }
     __syncthreads();
     const bool moves = c_.accepted;
-    if (moves && !(c_.total[dots_free_change] == 0)) contacts_current_ = false;
+    if (moves && !(c_.total[dots_free_change] == 0)) holds_ = false;
     iterate_ = moves ? w_.v.u : m_.iterate;
     residual_ = moves ? m_.trial_residual : m_.residual;
     free_ = moves ? m_.trial_free : m_.free;
@@ -120,8 +121,8 @@ class MultilevelRunner {
   PD_DEVICE void next_trial() {
     __syncthreads();
     if (threadIdx.x == 0)
-      c_.total[0] = c_.outer.propose(w_.progress.schedule.limit, corotated_,
-                                     corotates_ && builds_ == 0, has_contact_springs());
+      c_.total[0] =
+          c_.outer.propose(w_.progress.schedule.limit, made_, has_space_ && !made_, is_held());
     ++used_;
     __syncthreads();
     const bool accelerates = c_.outer.accelerates(),
@@ -174,9 +175,9 @@ class MultilevelRunner {
   PD_DEVICE std::int64_t vertices() const { return w_.plan.vertices; }
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
-  // whether the coarse problem includes contact springs
-  PD_DEVICE bool has_contact_springs() const {
-    return HasContacts && builds_ > 0 && corotation_.control().held;
+  // whether contacts or pins that M does not know hold vertices, and the coarse space includes them
+  PD_DEVICE bool is_held() const {
+    return made_ && (outliers_.some || pieces_.held);
   }
 
   PD_DEVICE void evaluate_vertex(int i,
@@ -219,7 +220,7 @@ class MultilevelRunner {
       const Vec3<T> change = u - vec3(m_.iterate[i]);
       sum[dots_change] = dot(change, change);
       if constexpr (HasContacts) {
-        for (int a = 0; corotates_ && a < 3; ++a) {
+        for (int a = 0; has_space_ && a < 3; ++a) {
           const Vec3<T> d = m_.trial_free[i].row[a] - m_.free[i].row[a];
           sum[dots_free_change] += dot(d, d);
         }
@@ -384,7 +385,10 @@ class MultilevelRunner {
 
   // ---- search direction: cuda/multilevel/direction.h
 
-  PD_DEVICE void corotate();
+  PD_DEVICE void find_space();
+  PD_DEVICE Vec3<T> moved(int i) const {
+    return moved_by_pieces(pieces_, w_.plan.levels, i);
+  }
   PD_DEVICE void correct(bool last);
   PD_DEVICE Vec3<T> direction(int i) const;
   PD_DEVICE void load_pairs(const Quad<T>* field, int i, Vec3<T> (&loaded)[history]) const;
@@ -396,17 +400,16 @@ class MultilevelRunner {
   MultilevelControl& c_;
   DeviceCycle<T> cycle_;
   std::byte* shared_;
-  bool lbfgs_, corotates_, corotated_ = false;
-  bool contacts_current_ = false;  // the coarse problem includes the contacts of the iterate
-  DeviceCorotation<T> corotation_;
+  bool lbfgs_, has_space_;
+  bool made_ = false;   // the step has made the coarse space
+  bool holds_ = false;  // it includes the contacts at the iterate
+  PiecesControl<T>& pieces_;
   Outliers<T> outliers_;
   // current iterate and residual; they point to the accepted trial until the next trial is written
   const Quad<T>*iterate_ = nullptr, *residual_ = nullptr;
   const Mat3<T>* free_ = nullptr;
   double patch_sum_[2] = {0, 0};
   int newest_ = 0, iteration_ = 0, used_ = 0;
-  // builds of the coarse problem, and restarts at the last build
-  int builds_ = 0, restarts_at_build_ = 0;
   bool parity_ = false;
 };
 

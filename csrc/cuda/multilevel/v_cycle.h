@@ -67,9 +67,17 @@ class DeviceCycle {
     m_.fine.right[i] = quad(right);
     m_.fine.initial[i] = quad(T(Smoother::first) * inverse * right);
   }
+  PD_DEVICE const Quad<T>* right_sides() const { return m_.fine.right; }
   PD_DEVICE Vec3<T> right_side(int i) const { return vec3(m_.fine.right[i]); }
   PD_DEVICE Vec3<T> result(int i) const { return vec3(m_.fine.z[i]); }
   PD_DEVICE void set_result(int i, const Vec3<T>& z) const { m_.fine.z[i] = quad(z); }
+
+  // Calls visit(vertex, A x there), whose results are visible to the whole team on return.
+  template <class Visit>
+  PD_DEVICE void multiply(const Quad<T>* x, const Visit& visit) {
+    each_product(fine_level(levels_), x, visit);
+    team_.barrier();
+  }
 
   // Computes result = M times the right-hand side, visible to the whole team on return.
   PD_DEVICE void run() {

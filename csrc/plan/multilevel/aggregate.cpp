@@ -182,29 +182,6 @@ void centre(const Graph& graph, const std::vector<std::int32_t>& label,
   });
 }
 
-// Moves each centre to the vertex nearest to the centroid of its aggregate.
-void centre_in_space(const Positions& position, const std::vector<std::int32_t>& label,
-                     std::vector<std::int32_t>& centres) {
-  std::vector<std::array<double, 4>> sum(centres.size(), {0, 0, 0, 0});
-  for (std::size_t v = 0; v < label.size(); ++v) {
-    if (label[v] < 0) continue;
-    for (int c = 0; c < 3; ++c) sum[label[v]][c] += position[v][c];
-    ++sum[label[v]][3];
-  }
-  std::vector<double> least(centres.size(), never);
-  for (std::size_t v = 0; v < label.size(); ++v) {
-    if (label[v] < 0) continue;
-    double square = 0;
-    for (int c = 0; c < 3; ++c) {
-      const double side = position[v][c] - sum[label[v]][c] / sum[label[v]][3];
-      square += side * side;
-    }
-    if (!(square < least[label[v]])) continue;
-    least[label[v]] = square;
-    centres[label[v]] = std::int32_t(v);
-  }
-}
-
 }  // namespace
 
 Members members_of(const Aggregates& groups) {
@@ -272,52 +249,6 @@ Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_o
     if (sweep + 1 < sweeps) centre(graph, fronts.label, centres, threads);
   }
   return {std::move(fronts.label), std::int32_t(centres.size())};
-}
-
-Aggregates aggregate_far_apart(const Graph& graph, const std::vector<std::uint8_t>& left_out,
-                               const Positions& position, std::int32_t wanted) {
-  std::vector<std::int32_t> centres;
-  Fronts fronts(graph);
-  const auto farthest = [&] {
-    std::int32_t best = -1;
-    for (std::int32_t v = 0; v < graph.vertices(); ++v) {
-      if (!left_out[v] && (best < 0 || fronts.distance[v] > fronts.distance[best])) best = v;
-    }
-    return best;
-  };
-  const auto spread_from = [&](std::int32_t vertex) {
-    fronts.add_source(vertex, 0);
-    fronts.advance();
-  };
-  // start at a vertex on the rim
-  if (const std::int32_t any = farthest(); any >= 0) {
-    spread_from(any);
-    const std::int32_t first = farthest();
-    fronts.clear();
-    centres.push_back(first);
-    spread_from(first);
-  }
-  while (!centres.empty() && std::ssize(centres) < wanted) {
-    const std::int32_t next = farthest();
-    if (!(fronts.distance[next] > 0)) break;
-    centres.push_back(next);
-    spread_from(next);
-  }
-  for (int sweep = 0; sweep < sweeps; ++sweep) {
-    join_nearest(fronts, centres, left_out);
-    if (sweep + 1 < sweeps) centre_in_space(position, fronts.label, centres);
-  }
-  return {std::move(fronts.label), std::int32_t(centres.size())};
-}
-
-std::vector<double> distances_to(const Graph& graph, const Aggregates& aggregates,
-                                 std::int32_t aggregate) {
-  Fronts fronts(graph);
-  for (std::int32_t v = 0; v < graph.vertices(); ++v) {
-    if (aggregates.of[v] == aggregate) fronts.add_source(v, aggregate);
-  }
-  fronts.advance();
-  return std::move(fronts.distance);
 }
 
 }  // namespace pd

@@ -59,15 +59,4 @@ Members members_of(const Aggregates& groups);
 Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_out,
                      std::int32_t wanted, int threads);
 
-using Positions = std::vector<std::array<double, 3>>;
-
-// The same for a few aggregates. Centres start as far apart as possible and move to the centroid of their aggregate,
-// so that the aggregates cut a body across.
-Aggregates aggregate_far_apart(const Graph& graph, const std::vector<std::uint8_t>& left_out,
-                               const Positions& position, std::int32_t wanted);
-
-// Distance of each vertex along the graph to the nearest vertex of an aggregate; infinite without a path.
-std::vector<double> distances_to(const Graph& graph, const Aggregates& aggregates,
-                                 std::int32_t aggregate);
-
 }  // namespace pd

@@ -21,8 +21,6 @@ constexpr int most_coarse_nodes = 256;              // 1024 unknowns of the dens
 constexpr std::int32_t most_of_two_levels = 12000;  // two levels serve up to so many free vertices
 constexpr double fine_smoothing = 1.14, middle_smoothing = 1.333;  // omega of I - omega D^-1 A
 constexpr double weakest_coupling = 0.02;  // relative to the scaled blocks of middle nodes
-constexpr int turning_groups = 4;          // as in solver/multilevel/deflation.h
-constexpr double turning_reach = 2;        // overlap of groups, in mean depths of their vertices
 constexpr double coarse_shift = 1e-12;  // relative to the diagonal: above the rounding of a pivot
 
 // Diagonal of a matrix of square blocks.
@@ -184,41 +182,6 @@ Aggregates group_nodes(const BlockMatrix& matrix,
   return limited(aggregate(graph, Mask(matrix.rows, 0), wanted, threads), most_coarse_nodes);
 }
 
-// Partition of unity [vertices, 4] of four overlapping groups: 1 inside, falling to 0 over a distance, divided by the
-// sum.
-std::vector<double> turning_weights(const Graph& graph, const Mask& held,
-                                    const Positions& position) {
-  const std::int32_t vertices = graph.vertices();
-  const Aggregates groups =
-      limited(aggregate_far_apart(graph, held, position, turning_groups), turning_groups);
-  std::array<std::vector<double>, turning_groups> distance;
-  for (int g = 0; g < turning_groups; ++g) distance[g] = distances_to(graph, groups, g);
-  // mean depth of vertices in their group
-  double depth = 0, count = 0;
-  for (std::int32_t v = 0; v < vertices; ++v) {
-    double least = HUGE_VAL;
-    for (int g = 0; g < turning_groups; ++g) {
-      if (g != groups.of[v]) least = std::min(least, distance[g][v]);
-    }
-    if (held[v] || !(least < HUGE_VAL)) continue;
-    depth += least;
-    ++count;
-  }
-  const double way = depth > 0 ? turning_reach * depth / count : 1;
-  std::vector<double> weights(std::size_t(vertices) * turning_groups, 0.0);
-  for (std::int32_t v = 0; v < vertices; ++v) {
-    if (held[v]) continue;
-    double* of = &weights[std::size_t(v) * turning_groups];
-    double sum = 0;
-    for (int g = 0; g < turning_groups; ++g) {
-      of[g] = std::max(0.0, 1 - distance[g][v] / way);
-      sum += of[g];
-    }
-    for (int g = 0; g < turning_groups; ++g) of[g] /= sum;
-  }
-  return weights;
-}
-
 using Numbers = std::vector<std::int32_t>;
 
 void store(BlockMatrix& matrix, Numbers& start, Numbers& column, std::vector<double>& value) {
@@ -274,7 +237,7 @@ BlockMatrix add_fine_level(MultilevelTables& t, BlockMatrix& matrix, const Block
 }
 
 // The same for the middle level, nodes at `position` with candidates [nodes, 4, 4].
-BlockMatrix add_middle_level(MultilevelTables& t, BlockMatrix matrix, const Positions& position,
+BlockMatrix add_middle_level(MultilevelTables& t, BlockMatrix matrix, const std::vector<std::array<double, 3>>& position,
                              const std::vector<double>& candidates, bool folded, int threads) {
   t.middle_inverse = scaled_inverse(matrix, threads);
   const Aggregates groups = group_nodes(matrix, position, threads);
@@ -320,7 +283,6 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   t.level_sizes[level_pieces] = pieces.count;
   t.piece_of = std::move(pieces.of);
   t.piece_weight = std::move(pieces.weight);
-  if (scene.folded) t.turning_weight = turning_weights(graph, fine.held, rest.position);
   if (scene.elements.vertices <= scene.most_direct) {
     store_direct(t, fine, threads);
     progress(1.0);

@@ -7,13 +7,13 @@
 
 namespace pd::inline PD_TARGET {
 
-// Range of the ratios of the step's values to the reference values.
-struct Range {
+// RatioRange of the ratios of the step's values to the reference values.
+struct RatioRange {
   double least = HUGE_VAL, largest = 0;
 
   PD_HD void count(double ratio) { add({ratio, ratio}); }
 
-  PD_HD void add(const Range& other) {
+  PD_HD void add(const RatioRange& other) {
     least = other.least < least ? other.least : least;
     largest = other.largest > largest ? other.largest : largest;
   }
@@ -30,12 +30,12 @@ struct MaterialMismatch {
 
   MaterialMismatch() = default;
 
-  PD_HD MaterialMismatch(const Range& elements, const Range& inertias)
+  PD_HD MaterialMismatch(const RatioRange& elements, const RatioRange& inertias)
       : trusted(larger(elements.largest, smaller(inertias.least, inertias.largest))),
         has_outliers(inertias.largest > outlier_ratio * trusted) {}
 
   // `common`: ratios of all vertices but outliers; `other_pins`: the step holds other vertices than M does
-  PD_HD void conclude(const Range& elements, const Range& inertias, const Range& common,
+  PD_HD void conclude(const RatioRange& elements, const RatioRange& inertias, const RatioRange& common,
                       bool other_pins) {
     scale = larger(elements.largest, common.largest);
     const double least = smaller(elements.least, common.least);
@@ -57,8 +57,8 @@ constexpr int ranges_count = 2;  // ranges that threads reduce at a time
 #endif
 template <class Runner, class T>
 PD_HD MaterialMismatch measure_mismatch(Runner& run, const Levels<T>& levels) {
-  Range first[ranges_count], second[ranges_count];
-  Range &elements = first[0], &inertias = first[1], &common = second[0], &differ = second[1];
+  RatioRange first[ranges_count], second[ranges_count];
+  RatioRange &elements = first[0], &inertias = first[1], &common = second[0], &differ = second[1];
   run.each_element([&](T stiffness, std::int64_t n) {
     elements.count(double(stiffness) / double(levels.reference_stiffness[n]));
   });

@@ -44,6 +44,10 @@ constexpr double piece_noise() {
 
 // Where the block of two of some pieces stands, `row` not before `column`.
 PD_HD constexpr int piece_pair(int row, int column) { return row * (row + 1) / 2 + column; }
+// Number of a pair of pieces where those of one piece come first.
+PD_HD constexpr int piece_list(int pieces, int row, int column) {
+  return row == column ? row : pieces + row * (row - 1) / 2 + column;
+}
 
 PD_HD int count_pieces(PieceMask mask) {
 #if defined(__CUDA_ARCH__)
@@ -53,19 +57,34 @@ PD_HD int count_pieces(PieceMask mask) {
 #endif
 }
 
-// sum a J_i^T J_j of the modes of two pieces, from sums k of a (1, r_i) (1, r_j)^T: J = [1, -[r]x].
-PD_HD void rigid_block(const double (&k)[4][4], double (&block)[piece_modes][piece_modes]) {
-  const double trace = k[1][1] + k[2][2] + k[3][3];
-  for (int a = 0; a < 3; ++a) {
-    for (int b = 0; b < 3; ++b) {
-      block[a][b] = a == b ? k[0][0] : 0;
-      block[3 + a][3 + b] = (a == b ? trace : 0) - k[1 + b][1 + a];
-      const int c = 3 - a - b;
-      const double sign = a == b ? 0 : b == (a + 1) % 3 ? 1 : -1;
-      block[a][3 + b] = a == b ? 0 : sign * k[0][1 + c];
-      block[3 + a][b] = a == b ? 0 : -sign * k[1 + c][0];
-    }
-  }
+// An entry of sum a J_i^T J_j of the modes of two pieces, from sums k of a (1, r_i) (1, r_j)^T: J = [1, -[r]x].
+PD_HD double rigid_entry(const double (&k)[4][4], int i, int j) {
+  const int a = i % 3, b = j % 3, c = 3 - a - b;
+  const bool turns = i >= 3, other_turns = j >= 3;
+  if (turns && other_turns)
+    return (a == b ? k[1][1] + k[2][2] + k[3][3] : 0) - k[1 + b][1 + a];
+  if (turns == other_turns) return a == b ? k[0][0] : 0;
+  if (a == b) return 0;
+  const double product = turns ? -k[1 + c][0] : k[0][1 + c];
+  return b == (a + 1) % 3 ? product : -product;
+}
+
+// The displacement by a mode at `arm` from the centre of its piece.
+template <class R>
+PD_HD Vec3<R> rigid_motion(int mode, const Vec3<R>& arm) {
+  const R none(scalar_of<R>(0)), one(scalar_of<R>(1));
+  const int a = mode % 3;
+  if (mode < 3) return {a == 0 ? one : none, a == 1 ? one : none, a == 2 ? one : none};
+  if (a == 0) return {none, -arm.z, arm.y};
+  if (a == 1) return {arm.z, none, -arm.x};
+  return {-arm.y, arm.x, none};
+}
+
+// Whether contacts take no direction from a vertex: a projector has less than this trace where they do.
+template <class R>
+PD_HD bool leaves_all(const Mat3<R>& free) {
+  const R trace = (free.row[0].x + free.row[1].y) + free.row[2].z;
+  return !any(trace < R(scalar_of<R>(2.5)));
 }
 
 // Whether number c of PieceStrain is more than zero for a mode: three translations, three turns.
@@ -157,6 +176,25 @@ struct PieceStrain {
     for (int k = 0; k < 3; ++k) h[mode][6 + k] = dot(frame.twist[k], axis);
   }
 };
+
+// sum += the products of the strains of two pieces; of six numbers of a strain half are none. `stress`: by `Dilates`.
+template <bool Dilates, class R>
+PD_HD void add_strain_products(const PieceStrain<R>& stress, const PieceStrain<R>& strain, R* sum) {
+  PD_UNROLL
+  for (int i = 0; i < piece_modes; ++i) {
+    PD_UNROLL
+    for (int j = 0; j < piece_modes; ++j) {
+      R total = sum[piece_modes * i + j];
+      PD_UNROLL
+      for (int c = 0; c < PieceStrain<R>::numbers; ++c) {
+        const bool moves = strain_moves(i, c) || (Dilates && c < 3);
+        if (moves && strain_moves(j, c))
+          total = multiply_add(stress.h[i][c], strain.h[j][c], total);
+      }
+      sum[piece_modes * i + j] = total;
+    }
+  }
+}
 
 // A symmetric matrix with its negative eigenvalues set to zero, by Jacobi's method without branches over lanes.
 template <int N, class R>
