@@ -291,8 +291,8 @@ inline py::dict list_pieces(int pieces, const Numbers& of, const Doubles& weight
   const auto span = [](const auto& array) {
     return std::span(array.data(), std::size_t(array.size()));
   };
-  pd::PieceLists lists = pd::list_pieces({pieces, span(of), span(weight), span(fine_start),
-                                                span(fine_column), span(corners)});
+  pd::PieceLists lists = pd::list_pieces(
+      {pieces, span(of), span(weight), span(fine_start), span(fine_column), span(corners)});
   py::dict arrays;
   const auto add = [&](const char* name, pd::PairList& list) {
     const std::string of_kind = std::string("piece_") + name;

@@ -47,10 +47,10 @@ constexpr int level_arrays = 0
 // Lengths of the arrays, by the names in multilevel.def.
 struct LevelRows {
   std::int64_t level_size, element, vertex, piece_pack, piece_pair_end, piece_row_task, piece_row,
-      piece_tet_task, piece_tet, fine_end, fine_entry,
-      fine_prolongation, host_fine_prolongation, device_fine_prolongation, fine_node_end,
-      middle_end, middle_entry, middle, middle_prolongation, host_middle_prolongation,
-      device_middle_prolongation, middle_node_end, coarse_entry, device_coarse_entry;
+      piece_tet_task, piece_tet, fine_end, fine_entry, fine_prolongation, host_fine_prolongation,
+      device_fine_prolongation, fine_node_end, middle_end, middle_entry, middle,
+      middle_prolongation, host_middle_prolongation, device_middle_prolongation, middle_node_end,
+      coarse_entry, device_coarse_entry;
 };
 
 #define X(name, type, width, rows, meaning) +1
@@ -251,9 +251,9 @@ constexpr int part_slot_array = int(DevicePlanArray::part_slot);
 // Lengths of the arrays, by the names in gpu_plan.def.
 struct DevicePlanRows {
   std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
-      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, part, level_end, sum, piece,
-      stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex,
-      coupled_block;
+      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, part, level_end,
+      sum, piece, stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender,
+      copied_vertex, coupled_block;
 };
 
 // Whether the arrays of the stencils follow those of the plan; a plan with levels has none.

@@ -33,10 +33,10 @@ enum LevelSize : int {
   level_fine_nodes,  // below the fine level
   level_middle_entries,
   level_middle_prolongations,
-  level_middle_nodes,  // below the middle level
-  level_direct,        // 1: no levels, A itself is solved directly
-  level_pieces,        // of the coarse space of L-BFGS
-  level_piece_packs,   // of tetrahedra that the same pieces move; 0 on a GPU
+  level_middle_nodes,     // below the middle level
+  level_direct,           // 1: no levels, A itself is solved directly
+  level_pieces,           // of the coarse space of L-BFGS
+  level_piece_packs,      // of tetrahedra that the same pieces move; 0 on a GPU
   level_piece_row_tasks,  // on a GPU: for sums of pairs of pieces over rows of A, and their rows
   level_piece_rows,
   level_piece_tet_tasks,  // the same over tetrahedra
@@ -282,13 +282,7 @@ bool shares_effects(const Effects<T>& effects) {
 }
 
 // from lbfgs on, the solver is multilevel
-enum class ScheduleKind : int {
-  jacobi = 0,
-  classic = 1,
-  guarded = 2,
-  lbfgs = 3,
-  momentum = 4
-};
+enum class ScheduleKind : int { jacobi = 0, classic = 1, guarded = 2, lbfgs = 3, momentum = 4 };
 enum class StartKind : int { velocity = 0, inertial = 1, given = 2 };
 
 struct Settings {

@@ -51,7 +51,7 @@ def most_direct(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
 def reordered(levels: dict[str, np.ndarray], place: np.ndarray) -> dict[str, np.ndarray]:
     """The arrays of a preconditioner whose vertex i is to stand at place[i]."""
     out = dict(levels)
-    for name in ("reference_inertia", "fine_inverse", "turning_weight"):
+    for name in ("reference_inertia", "fine_inverse", "piece_of", "piece_weight"):
         out[name] = np.empty_like(levels[name])
         out[name][place] = levels[name]
 
@@ -87,11 +87,14 @@ def share(gpu: pd.Simulator, cpu: pd.Simulator) -> None:
     if gpu.plan.level_sizes[6]:
         reference = (array.cpu() for array in stored_reference(gpu.plan.arrays))
         cpu.plan = precondition_plan(cpu.plan, cpu.scene.values(), *reference, most_direct=multilevel.MOST_DIRECT)
-        weight = gpu.plan.turning_weight.cpu().numpy()
-        arrays = {"turning_weight": np.empty_like(weight)}
-        arrays["turning_weight"][place] = weight
+        arrays = {"level_sizes": cpu.plan.level_sizes.numpy()}
+        for name in ("piece_of", "piece_weight"):
+            found = getattr(gpu.plan, name).cpu().numpy()
+            arrays[name] = np.empty_like(found)
+            arrays[name][place] = found
     else:
         arrays = reordered(build_levels(gpu, folded=False), place)
+    arrays |= multilevel._pack_tets(cpu.plan, arrays)
     kept = cpu.plan.arrays[: -len(MULTILEVEL_TABLE)]
     own = cpu.plan.arrays[-len(MULTILEVEL_TABLE) :]
     new = (torch.as_tensor(arrays.get(row.name, t)).to(t.dtype) for row, t in zip(MULTILEVEL_TABLE, own, strict=True))

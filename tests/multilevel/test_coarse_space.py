@@ -7,13 +7,15 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from cases import Case, contact_block, hard_start, slivers
+from cases import Case, box, contact_block, hard_start, slivers
 from multilevel_cases import Tables, converged, irregular, slabs, swing, twist
 from runs import arguments_of, displacement, simulator, state_of
 from scipy.sparse import csr_array
 
 import torchpd as pd
 from torchpd.plan import Plan
+from torchpd.plan.gpu_plan import compile_device_plan, device_table
+from torchpd.plan.preconditioner import precondition_plan, stored_reference
 from torchpd.reference.piece_step import PieceCycle
 from torchpd.reference.pieces import Pieces
 from torchpd.reference.solvers import newton, preconditioned_lbfgs, relative_error, solve_with_contact
@@ -225,3 +227,60 @@ def test_packs_hold_the_tetrahedra_that_the_same_pieces_move() -> None:
     order = plan.tet_order.numpy().ravel()
     union = [len(frozenset().union(*(together[t] for t in order[pack[pack >= 0]]))) for pack in packs]
     assert np.mean(union) <= 1.5 * np.mean([len(together[t]) for t in user])
+
+
+def test_a_piece_of_one_vertex_has_no_turns() -> None:
+    """Rounding moves it about its centre, and may not make a mode: then the space would fail."""
+    vertices, tets = box((0.6, 0.2, 0.2), (6, 2, 2))
+    body = pd.Solid(pd.TetMesh(vertices, tets), youngs=1e6, poisson=0.4, density=1000.0)
+    velocities = np.zeros_like(vertices)
+    velocities[:, 1] = -30.0 * vertices[:, 0] ** 2
+    scene = pd.Scene(body, pd.Pin(body, vertices[:, 0] == 0.0), pd.Gravity())
+    case = Case(scene, vertices, velocities, 1.0 / 60.0)
+    sim = simulator(case, torch.float64, solver=pd.Multilevel(), iterations=3)
+    pieces, problem = pieces_of(sim.plan), case.problem()
+    assert (pieces.weights > 0.0).sum(axis=0).min() == 1
+    cycle, first = PieceCycle(problem, Tables(sim.plan), pieces), problem.first_iterate(case.start)
+    expected = preconditioned_lbfgs(problem, first, cycle, iterations=3, observe=cycle.observe)
+    u = displacement(sim, sim(state_of(case, sim), **arguments_of(case, sim)))
+    assert np.abs(u - expected).max() <= 1e-12 * np.abs(expected - first).max()
+
+
+def test_lists_hold_what_pairs_of_pieces_share() -> None:
+    """For a GPU: every row of A and every tetrahedron, once for each pair of pieces that it moves, in tasks."""
+    case = swing(3, 1e6)
+    sim = simulator(case, torch.float64, solver=pd.Multilevel())
+    values, stored = case.scene.values(), stored_reference(sim.plan.arrays)
+    made = Plan(compile_device_plan(values, 4, 3, torch.float64, progress=False), device_table(values))
+    plan = precondition_plan(made, values, *stored, most_direct=0)
+    of, weight = plan.piece_of.numpy().reshape(-1, 4), plan.piece_weight.numpy().reshape(-1, 4)
+    own = [frozenset(pieces[share > 0.0].tolist()) for pieces, share in zip(of, weight, strict=True)]
+    start, column = plan.fine_start.numpy(), plan.fine_column.numpy()
+    near = [frozenset().union(*(own[j] for j in column[start[i] : start[i + 1]])) for i in range(len(own))]
+    rows = {(i, p, q) for i in range(len(own)) for p in own[i] for q in near[i] if q <= p}
+    assert listed(plan, "row") == rows
+    tets = plan.pair_tet.numpy().reshape(-1, 2, 32).swapaxes(1, 2).ravel()
+    internal = np.argsort(plan.vertex_order.numpy())
+    moved = {n: frozenset().union(*(own[internal[v]] for v in values.tets[t])) for n, t in enumerate(tets) if t >= 0}
+    assert listed(plan, "tet") == {(n, p, q) for n, both in moved.items() for p in both for q in both if q <= p}
+    patches = np.repeat(np.arange(4), np.diff(plan.patch_block.numpy()))
+    item = plan.piece_tet.numpy().reshape(-1, 2)
+    np.testing.assert_array_equal(item[:, 1], patches[item[:, 0] // 64])
+
+
+def listed(plan: Plan, kind: str) -> set[tuple[int, int, int]]:
+    """Items of the tasks with their pieces, in which none stands twice and those of a pair ascend."""
+    task = getattr(plan, f"piece_{kind}_task").numpy().reshape(-1, 4)
+    start = getattr(plan, f"piece_{kind}_start").numpy()
+    item = getattr(plan, f"piece_{kind}").numpy().reshape(len(getattr(plan, f"piece_{kind}")), -1)[:, 0]
+    count = int(plan.level_sizes[7])
+    pairs = [(p, p) for p in range(count)] + [(p, q) for p in range(count) for q in range(p)]
+    assert len(start) == len(pairs) + 1
+    assert start[-1] == len(task)
+    for number, (p, q) in enumerate(pairs):
+        assert (task[start[number] : start[number + 1], :2] == (p, q)).all()
+    np.testing.assert_array_equal(task[1:, 2], task[:-1, 3])
+    found = [(int(n), int(p), int(q)) for p, q, first, end in task for n in item[first:end]]
+    assert len(set(found)) == len(found) == len(item)
+    assert all(a < b for (a, *one), (b, *other) in pairwise(found) if one == other)
+    return set(found)

@@ -244,8 +244,11 @@ class PiecesMaker {
       add_block(f.energy, p, q, [&](int i, int j) { return rigid_entry(moments.inertia, i, j); });
     });
     add_blocks(f.energy, work_.patches, work_.strains);
-    for (int i = 0; i < work_.unknowns; ++i)
-      f.scale[i] = f.matrix.at(i, i) > 0 ? 1 / std::sqrt(f.matrix.at(i, i)) : 0;
+    for (int i = 0; i < work_.unknowns; ++i) {
+      const int piece = i / piece_modes, first = piece_modes * piece;
+      f.scale[i] = mode_scale<T>(i - first, f.matrix.at(i, i), f.matrix.at(first, first),
+                                 wide(work_.centre[piece], lane));
+    }
     rescale(f.energy, f.scale, times * piece_noise<T>());
     rescale(f.matrix, f.scale, piece_noise<T>());
     if (f.unheld.size() > 0) f.unheld = f.energy;

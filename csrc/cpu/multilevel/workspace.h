@@ -25,7 +25,7 @@ struct MultilevelWork {
       *trial_free;  // [vertices] projectors on the free directions; null without contacts
   // [vertices] dE/du without the contacts' reaction, and friction; null without contacts
   Value *gradient, *trial_gradient, *friction, *trial_friction;
-  Wide (*sums)[dots];             // [chunks]
+  Wide (*sums)[dots];                  // [chunks]
   RatioRange (*ranges)[ranges_count];  // [threads] ratios of the material to that of M
   int chunks;
 

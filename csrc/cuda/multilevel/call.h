@@ -17,7 +17,7 @@ constexpr int dots_s_residual = dots_sg + history, dots_change = dots_s_residual
 constexpr int dots_displacement = dots_change + 1, dots_yy = dots_displacement + 1;
 constexpr int dots_free_change = dots_yy + 1, trial_dots = dots_free_change + 1;
 constexpr int most_sums = trial_dots;  // of any pass
-constexpr int most_chunks = 640;  // whose sums every block reduces
+constexpr int most_chunks = 640;       // whose sums every block reduces
 // Threads per block. A block has a multiprocessor to itself; for meshes of one patch, two blocks
 // share one. Each thread has enough registers for all of its loads in flight.
 constexpr int multilevel_threads = 512, small_multilevel_threads = 256;
@@ -31,21 +31,21 @@ struct MultilevelMemory {
   Quad<T>*s, *y;                                // [teams, history, vertices], with L-BFGS
   Mat3<T>*free, *trial_free;  // [teams, vertices], with contacts, as are the next four
   Quad<T>*gradient, *trial_gradient, *friction, *trial_friction;
-  CycleMemory<T> cycle;            // [teams, ...]
-  PiecesMemory<T> pieces;          // [teams, ...], with a coarse space
-  double* chunk_dots;              // [teams, 2, most_sums, chunks], double-buffered
-  double* patch_sums;              // [teams, patches, sums_count]
-  RatioRange* ranges;                   // [teams, 2, blocks, ranges_count], double-buffered
-  MaterialMismatch* mismatch;      // [batch]
-  unsigned* counter;               // [teams], zero at the launch
+  CycleMemory<T> cycle;        // [teams, ...]
+  PiecesMemory<T> pieces;      // [teams, ...], with a coarse space
+  double* chunk_dots;          // [teams, 2, most_sums, chunks], double-buffered
+  double* patch_sums;          // [teams, patches, sums_count]
+  RatioRange* ranges;          // [teams, 2, blocks, ranges_count], double-buffered
+  MaterialMismatch* mismatch;  // [batch]
+  unsigned* counter;           // [teams], zero at the launch
 };
 
 template <class T>
 struct MultilevelCall {
   StreamCall<T> stream;
   MultilevelMemory<T> memory;
-  int teams, blocks;         // blocks of a team
-  std::size_t shared_cycle;  // offset of the cycle's fields in shared memory; 0: in device memory
+  int teams, blocks;          // blocks of a team
+  std::size_t shared_cycle;   // offset of the cycle's fields in shared memory; 0: in device memory
   std::size_t shared_pieces;  // offset of PiecesControl in shared memory; 0: none
 
   PD_HD const DevicePlan<T>& plan() const { return stream.step.plan; }

@@ -56,8 +56,7 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::find_space() {
     if (threadIdx.x == 0) c_.outer.rebuilt();
   }
   if constexpr (HasContacts) {
-    if (made_ && !holds_)
-      team_ = hold_pieces(in, free_, pieces_, team_, scratch, c_.outer.scale);
+    if (made_ && !holds_) team_ = hold_pieces(in, free_, pieces_, team_, scratch, c_.outer.scale);
     holds_ = made_;
   }
 }

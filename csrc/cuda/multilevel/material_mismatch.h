@@ -8,8 +8,8 @@ namespace pd::inline PD_TARGET {
 template <class T>
 class MismatchRunner {
  public:
-  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, const Moduli<T>& moduli, RatioRange* memory,
-                           BlockTeam& team)
+  PD_DEVICE MismatchRunner(const StreamWork<T, false>& w, const Moduli<T>& moduli,
+                           RatioRange* memory, BlockTeam& team)
       : w_(w), moduli_(moduli), memory_(memory), team_(team) {}
 
   template <class Visit>

@@ -28,7 +28,7 @@ class PieceSums {
     each_row(number, [&](const PieceTask& task, int i) {
       if (!(in_.u[i].w > T(0))) return;
       const double weight = double(share_of(levels_, i, task.row));
-      const Vec3<double> x = wide(vec3(in_.x[i])), y = x + wide(vec3(in_.iterate[i]));
+      const Vec3<double> x = widened(in_.x[i]), y = x + widened(in_.iterate[i]);
       const double part[centre_sums] = {1, x.x, x.y, x.z, y.x, y.y, y.z};
 #pragma unroll
       for (int c = 0; c < centre_sums; ++c) sum[c] += weight * part[c];
@@ -49,10 +49,9 @@ class PieceSums {
         image[2] += value * double(arm.y);
         image[3] += value * double(arm.z);
       });
-      const Vec3<double> c = wide(vec3(m_.centre[task.column]));
+      const Vec3<double> c = widened(m_.centre[task.column]);
       const double a = double(in_.inertia[i].w) * double(share_of(levels_, i, task.column));
-      const Vec3<double> own = wide(vec3(at)) - wide(vec3(m_.centre[task.row])),
-                         other = wide(vec3(at)) - c;
+      const Vec3<double> own = widened(at) - widened(m_.centre[task.row]), other = widened(at) - c;
       const double weight = double(share_of(levels_, i, task.row));
       const double left[4] = {weight, weight * own.x, weight * own.y, weight * own.z};
       const double right[2][4] = {{image[0], image[1] - image[0] * c.x, image[2] - image[0] * c.y,
@@ -77,7 +76,8 @@ class PieceSums {
       Vec3<double> own[piece_modes] = {};
       add_held(free[i], m_.arm[i], task.row, double(share_of(levels_, i, task.row)), own);
 #pragma unroll
-      for (int n = 0; n < piece_block; ++n) sum[n] += dot(own[n / piece_modes], force[n % piece_modes]);
+      for (int n = 0; n < piece_block; ++n)
+        sum[n] += dot(own[n / piece_modes], force[n % piece_modes]);
     });
     write_warp_sums(sum, row_sums(number));
   }
@@ -97,9 +97,6 @@ class PieceSums {
   PD_DEVICE static int lane() { return int(threadIdx.x) % warp_size; }
   PD_DEVICE double* row_sums(int number) const {
     return m_.row_sums + std::int64_t(number) * piece_block;
-  }
-  PD_DEVICE static Vec3<double> wide(const Vec3<T>& a) {
-    return {double(a.x), double(a.y), double(a.z)};
   }
 
   // visit(task, vertex) on the lanes of a warp
@@ -128,8 +125,9 @@ class PieceSums {
   // adds the part of all modes that contacts hold, times a factor
   PD_DEVICE void add_held(const Mat3<T>& free, const Quad<T>& at, int piece, double factor,
                           Vec3<double> (&sum)[piece_modes]) const {
-    const Vec3<double> arm = wide(vec3(at)) - wide(vec3(m_.centre[piece]));
-    const Vec3<double> row[3] = {wide(free.row[0]), wide(free.row[1]), wide(free.row[2])};
+    const Vec3<double> arm = widened(at) - widened(m_.centre[piece]);
+    const Vec3<double> row[3] = {widened(quad(free.row[0])), widened(quad(free.row[1])),
+                                 widened(quad(free.row[2]))};
 #pragma unroll
     for (int m = 0; m < piece_modes; ++m) {
       const Vec3<double> d = rigid_motion(m, arm);
@@ -159,8 +157,8 @@ class PieceSums {
       }
     }
     const PieceFrame<T> frame(deformation_gradient(x, inverse), numbers.weight, pressure);
-    const PieceStrain<T> row(inverse, frame, arm[0], share[0]), column(inverse, frame, arm[1],
-                                                                      share[1]);
+    const PieceStrain<T> row(inverse, frame, arm[0], share[0]),
+        column(inverse, frame, arm[1], share[1]);
     add_strain_products<has_poisson_ratio>(
         row.template stressed<has_poisson_ratio>(numbers.weight, pressure), column, sum);
   }

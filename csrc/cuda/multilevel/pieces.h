@@ -12,16 +12,16 @@ constexpr int most_piece_unknowns = piece_modes * most_pieces;
 // Device memory of a team. Tasks are those of the plan (plan/multilevel/piece_lists.h).
 template <class T>
 struct PiecesMemory {
-  Quad<T>* arm;       // [vertices] position from the middle, and 1, or 0 where a pin holds the vertex
-  Quad<T>* field;     // [vertices] Z times modes, or A times a field
-  Quad<T>* centre;    // [pieces] from the middle
-  double* row_sums;   // [tasks of rows, piece_block]
-  double* strains;    // [tasks of tetrahedra, piece_block]
-  double* mode;       // [unknowns] of Z; where it is made, springs on the diagonal of Hc
-  double* scale;      // [unknowns] 1 / sqrt(Ac_ii), 0 for a mode that moves nothing
-  double* block[2];   // [pairs, piece_block] Hc and Ac in that scale, then their inverses
-  double* unheld;     // [pairs, piece_block] Hc in that scale before contacts hold it
-  double* panel;      // [2, 2, pieces, piece_block] a column of both, double-buffered
+  Quad<T>* arm;     // [vertices] position from the middle, and 1, or 0 where a pin holds the vertex
+  Quad<T>* field;   // [vertices] Z times modes, or A times a field
+  Quad<T>* centre;  // [pieces] from the middle
+  double* row_sums;  // [tasks of rows, piece_block]
+  double* strains;   // [tasks of tetrahedra, piece_block]
+  double* mode;      // [unknowns] of Z; where it is made, springs on the diagonal of Hc
+  double* scale;     // [unknowns] 1 / sqrt(Ac_ii), 0 for a mode that moves nothing
+  double* block[2];  // [pairs, piece_block] Hc and Ac in that scale, then their inverses
+  double* unheld;    // [pairs, piece_block] Hc in that scale before contacts hold it
+  double* panel;     // [2, 2, pieces, piece_block] a column of both, double-buffered
 };
 
 // The arrays of one team.
@@ -65,6 +65,11 @@ struct PiecesControl {
   }
 };
 static_assert(sizeof(PiecesControl<double>) <= pieces_bytes);
+
+template <class T>
+PD_DEVICE Vec3<double> widened(const Quad<T>& a) {
+  return {double(a.x), double(a.y), double(a.z)};
+}
 
 // A part of the items of a pair of pieces, for a warp.
 struct alignas(16) PieceTask {
@@ -153,7 +158,8 @@ class PiecesApplication {
     // turns about the centre of the piece
     if (int(threadIdx.x) < levels_.pieces) {
       double* m = modes + piece_modes * threadIdx.x;
-      const Vec3<double> turn = cross(centre(int(threadIdx.x)), Vec3<double>{m[0], m[1], m[2]});
+      const Vec3<double> turn =
+          cross(widened(m_.centre[threadIdx.x]), Vec3<double>{m[0], m[1], m[2]});
       m[3] -= turn.x;
       m[4] -= turn.y;
       m[5] -= turn.z;
@@ -201,17 +207,12 @@ class PiecesApplication {
     if (int(threadIdx.x) < levels_.pieces) {
       const int piece = threadIdx.x;
       const double* m = m_.mode + piece_modes * piece;
-      const Vec3<double> turn = {m[3], m[4], m[5]}, back = cross(turn, centre(piece));
+      const Vec3<double> turn = {m[3], m[4], m[5]}, back = cross(turn, widened(m_.centre[piece]));
       T* motion = c_.motion + piece_modes * piece;
       write3(motion, {T(m[0] - back.x), T(m[1] - back.y), T(m[2] - back.z)});
       write3(motion + 3, {T(turn.x), T(turn.y), T(turn.z)});
     }
     __syncthreads();
-  }
-
-  PD_DEVICE Vec3<double> centre(int piece) const {
-    const Quad<T> c = m_.centre[piece];
-    return {double(c.x), double(c.y), double(c.z)};
   }
 
   const Levels<T>& levels_;
@@ -240,9 +241,8 @@ __device__ __noinline__ BlockTeam hide_pieces(PiecesControl<T>& control, CycleMe
     field[i] = quad(moved_by_pieces(control, levels, i));
   team.barrier();
   DeviceCycle<T> cycle(levels, memory, team, nullptr);
-  cycle.multiply(field, [&](int i, const Vec3<T>& product) {
-    cycle.set(i, cycle.right_side(i) - product);
-  });
+  cycle.multiply(
+      field, [&](int i, const Vec3<T>& product) { cycle.set(i, cycle.right_side(i) - product); });
   return team;
 }
 

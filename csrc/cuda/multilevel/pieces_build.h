@@ -114,7 +114,8 @@ class PiecesMaker {
     const int pair = piece_list(levels_.pieces, row, column);
     double sum = 0;
 #pragma unroll 4
-    for (int t = start[pair]; t < start[pair + 1]; ++t) sum += sums[std::int64_t(t) * piece_block + n];
+    for (int t = start[pair]; t < start[pair + 1]; ++t)
+      sum += sums[std::int64_t(t) * piece_block + n];
     return sum;
   }
 
@@ -136,10 +137,11 @@ class PiecesMaker {
       const std::int64_t to = std::int64_t(at.pair()) * piece_block + e;
       const double matrix = rigid_entry(k[0], i, j);
       m_.block[1][to] = matrix;
-      m_.block[0][to] =
-          rigid_entry(k[1], i, j) + add_up(m_.strains, levels_.piece_tet_start, at.row, at.column, from);
+      m_.block[0][to] = rigid_entry(k[1], i, j) +
+                        add_up(m_.strains, levels_.piece_tet_start, at.row, at.column, from);
       if (at.row == at.column && i == e % piece_modes && i == j)
-        m_.scale[piece_modes * at.row + i] = matrix > 0 ? 1 / sqrt(matrix) : 0;
+        m_.scale[piece_modes * at.row + i] =
+            mode_scale<T>(i, matrix, k[0][0][0], widened(m_.centre[at.row]));
     }
     __syncwarp();
   }
@@ -162,8 +164,7 @@ class PiecesMaker {
 
   PD_DEVICE void store(int matrix, const TriangleBlock& at, int e, double value) const {
     m_.block[matrix][std::int64_t(at.pair()) * piece_block + e] = value;
-    if (at.column == 0)
-      sweeps_.panel(0, matrix)[std::int64_t(at.row) * piece_block + e] = value;
+    if (at.column == 0) sweeps_.panel(0, matrix)[std::int64_t(at.row) * piece_block + e] = value;
   }
 
   // Both matrices in the scale of Ac; one where a mode moves nothing.
@@ -192,8 +193,8 @@ class PiecesMaker {
     each_entry(1, [&](int, const TriangleBlock& at, int e) {
       double value = m_.unheld[std::int64_t(at.pair()) * piece_block + e];
       if (held)
-        value += scale_of(at, e) * add_up(m_.row_sums, levels_.piece_row_start, at.row, at.column,
-                                          place(at, e));
+        value += scale_of(at, e) *
+                 add_up(m_.row_sums, levels_.piece_row_start, at.row, at.column, place(at, e));
       store(0, at, e, value);
     });
   }

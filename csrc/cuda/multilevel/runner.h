@@ -176,9 +176,7 @@ class MultilevelRunner {
   PD_DEVICE static Vec3<T> none() { return {T(0), T(0), T(0)}; }
 
   // whether contacts or pins that M does not know hold vertices, and the coarse space includes them
-  PD_DEVICE bool is_held() const {
-    return made_ && (outliers_.some || pieces_.held);
-  }
+  PD_DEVICE bool is_held() const { return made_ && (outliers_.some || pieces_.held); }
 
   PD_DEVICE void evaluate_vertex(int i,
                                  const typename Vertices<T, HasContacts>::LoadedVertex& loaded,
@@ -348,8 +346,8 @@ class MultilevelRunner {
     }
     if (j != 0) return;
     // s.y of c_.total: another lane has just written that of the table
-    pairs.admit(newest_, k > 0 && c_.accepted, c_.total[dots_sy + newest_],
-                c_.total[dots_change], c_.total[dots_yy]);
+    pairs.admit(newest_, k > 0 && c_.accepted, c_.total[dots_sy + newest_], c_.total[dots_change],
+                c_.total[dots_yy]);
     if (c_.outer.clears_pairs()) pairs.clear();
   }
 
@@ -386,9 +384,7 @@ class MultilevelRunner {
   // ---- search direction: cuda/multilevel/direction.h
 
   PD_DEVICE void find_space();
-  PD_DEVICE Vec3<T> moved(int i) const {
-    return moved_by_pieces(pieces_, w_.plan.levels, i);
-  }
+  PD_DEVICE Vec3<T> moved(int i) const { return moved_by_pieces(pieces_, w_.plan.levels, i); }
   PD_DEVICE void correct(bool last);
   PD_DEVICE Vec3<T> direction(int i) const;
   PD_DEVICE void load_pairs(const Quad<T>* field, int i, Vec3<T> (&loaded)[history]) const;

@@ -237,7 +237,8 @@ BlockMatrix add_fine_level(MultilevelTables& t, BlockMatrix& matrix, const Block
 }
 
 // The same for the middle level, nodes at `position` with candidates [nodes, 4, 4].
-BlockMatrix add_middle_level(MultilevelTables& t, BlockMatrix matrix, const std::vector<std::array<double, 3>>& position,
+BlockMatrix add_middle_level(MultilevelTables& t, BlockMatrix matrix,
+                             const std::vector<std::array<double, 3>>& position,
                              const std::vector<double>& candidates, bool folded, int threads) {
   t.middle_inverse = scaled_inverse(matrix, threads);
   const Aggregates groups = group_nodes(matrix, position, threads);

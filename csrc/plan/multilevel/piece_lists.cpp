@@ -16,8 +16,7 @@ constexpr std::int64_t lanes = 32, least_turns = 4, many_tasks = 4096;
 std::vector<PieceMask> masks_of(const PieceMesh& mesh) {
   std::vector<PieceMask> masks(mesh.of.size() / pieces_of_vertex, 0);
   for (std::size_t place = 0; place < mesh.of.size(); ++place) {
-    if (mesh.weight[place] > 0)
-      masks[place / pieces_of_vertex] |= PieceMask(1) << mesh.of[place];
+    if (mesh.weight[place] > 0) masks[place / pieces_of_vertex] |= PieceMask(1) << mesh.of[place];
   }
   return masks;
 }
@@ -81,15 +80,15 @@ PieceLists list_pieces(const PieceMesh& mesh) {
     for (const std::int32_t corner : mesh.corners.subspan(4 * tet, 4)) mask |= own[corner];
     return mask;
   };
-  return {list_pairs(mesh.pieces, std::ssize(own),
-                     [&](std::int64_t i, const auto& add) {
-                       each_of(own[i], [&](int row) { add_columns(row, near[i], add); });
-                     }),
-          list_pairs(mesh.pieces, std::ssize(mesh.corners) / 4,
-                     [&](std::int64_t tet, const auto& add) {
-                       const PieceMask mask = mask_of_tet(tet);
-                       each_of(mask, [&](int row) { add_columns(row, mask, add); });
-                     })};
+  return {
+      list_pairs(mesh.pieces, std::ssize(own),
+                 [&](std::int64_t i, const auto& add) {
+                   each_of(own[i], [&](int row) { add_columns(row, near[i], add); });
+                 }),
+      list_pairs(mesh.pieces, std::ssize(mesh.corners) / 4, [&](std::int64_t tet, const auto& add) {
+        const PieceMask mask = mask_of_tet(tet);
+        each_of(mask, [&](int row) { add_columns(row, mask, add); });
+      })};
 }
 
 }  // namespace pd

@@ -16,7 +16,8 @@ struct PairList {
 };
 
 struct PieceLists {
-  PairList rows;  // vertices that the first piece moves, with a vertex in their row that the second one moves
+  PairList
+      rows;  // vertices that the first piece moves, with a vertex in their row that the second one moves
   PairList tets;  // tetrahedra with vertices that the one moves, and such of the other
 };
 

@@ -35,8 +35,8 @@ struct MaterialMismatch {
         has_outliers(inertias.largest > outlier_ratio * trusted) {}
 
   // `common`: ratios of all vertices but outliers; `other_pins`: the step holds other vertices than M does
-  PD_HD void conclude(const RatioRange& elements, const RatioRange& inertias, const RatioRange& common,
-                      bool other_pins) {
+  PD_HD void conclude(const RatioRange& elements, const RatioRange& inertias,
+                      const RatioRange& common, bool other_pins) {
     scale = larger(elements.largest, common.largest);
     const double least = smaller(elements.least, common.least);
     spread = other_pins ? 1 : 1 - least / larger(elements.largest, inertias.largest);

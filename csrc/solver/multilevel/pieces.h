@@ -61,12 +61,20 @@ PD_HD int count_pieces(PieceMask mask) {
 PD_HD double rigid_entry(const double (&k)[4][4], int i, int j) {
   const int a = i % 3, b = j % 3, c = 3 - a - b;
   const bool turns = i >= 3, other_turns = j >= 3;
-  if (turns && other_turns)
-    return (a == b ? k[1][1] + k[2][2] + k[3][3] : 0) - k[1 + b][1 + a];
+  if (turns && other_turns) return (a == b ? k[1][1] + k[2][2] + k[3][3] : 0) - k[1 + b][1 + a];
   if (turns == other_turns) return a == b ? k[0][0] : 0;
   if (a == b) return 0;
   const double product = turns ? -k[1 + c][0] : k[0][1 + c];
   return b == (a + 1) % 3 ? product : -product;
+}
+
+// 1 / sqrt(Ac_ii) of a mode, 0 where it moves nothing: a turn of vertices in line, which the rounding of positions moves.
+// `shift`: Ac_ii of a translation of the piece; `centre`: of the piece, from the middle
+template <class T>
+PD_HD double mode_scale(int mode, double own, double shift, const Vec3<double>& centre) {
+  constexpr double unit = 16 * double(epsilon<T>());
+  const double least = mode < 3 ? 0 : unit * unit * dot(centre, centre) * shift;
+  return own > least ? 1 / sqrt(own) : 0;
 }
 
 // The displacement by a mode at `arm` from the centre of its piece.
