@@ -102,8 +102,8 @@ def thinned(pieces: Pieces) -> Pieces:
     for vertex in range(weights.shape[0]):
         own = slice(weights.indptr[vertex], weights.indptr[vertex + 1])
         numbers, shares = weights.indices[own], weights.data[own]
-        kept = np.lexsort((numbers, -shares))[:VERTEX]
-        kept = [place for rank, place in enumerate(kept) if rank == 0 or shares[place] >= LEAST]
+        largest = enumerate(np.lexsort((numbers, -shares))[:VERTEX])
+        kept = [place for rank, place in largest if rank == 0 or shares[place] >= LEAST]
         rows += [vertex] * len(kept)
         columns += [int(numbers[place]) for place in kept]
         entries += list(shares[kept] / shares[kept].sum())

@@ -1,4 +1,4 @@
-// Members of DeviceCycle that multiply by L^-1, by rows or by columns.
+// Members of DeviceCycle that multiply by L^-1, by rows or by columns, and the last phase of a cycle.
 #pragma once
 #include "cuda/multilevel/v_cycle.h"
 
@@ -54,6 +54,29 @@ PD_DEVICE void DeviceCycle<T>::multiply_factor(const TriangularFactor& a) {
   } else {
 #pragma unroll 1
     for (int i = team_.warp() * 4; i < a.n; i += team_.warps() * 4) multiply_rows<4>(a, i);
+  }
+}
+
+template <class T>
+template <class Row>
+PD_DEVICE void DeviceCycle<T>::run_last(int count, const Row& row) {
+  if (levels_.direct) {
+    constexpr int together = 4;
+    const int warps = int(blockDim.x) / warp_size;
+#pragma unroll 1
+    for (int t = int(threadIdx.x) / warp_size * together; t < count; t += warps * together) {
+      if (row(t) < levels_.vertices) multiply_rows<together>(columns(), row(t));
+    }
+    return;
+  }
+  constexpr int lanes = prolongation_lanes<1>;
+  const int last = levels_.vertices - 1, lane = int(threadIdx.x) % lanes;
+  const Level<1, T> fine = fine_level(levels_);
+#pragma unroll 1
+  for (int t = int(threadIdx.x) / lanes; t < count; t += int(blockDim.x) / lanes) {
+    const int at = min(row(t), last);
+    const Vec3<T> sum = sum_over_lanes(prolongated(fine, below_fine(), at, 0, lane), lanes / 2, 1);
+    if (lane == 0 && row(t) <= last) m_.fine.z[at] = quad(vec3(m_.fine.z[at]) + sum);
   }
 }
 

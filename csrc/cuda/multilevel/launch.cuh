@@ -4,6 +4,7 @@
 #include "cuda/multilevel/dense_solve.h"
 #include "cuda/multilevel/direction.h"
 #include "cuda/multilevel/material_mismatch.h"
+#include "cuda/multilevel/trial.h"
 #include "cuda/stream/multilevel_interface.h"
 #include "views/shared_memory.h"
 

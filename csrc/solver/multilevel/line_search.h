@@ -166,14 +166,14 @@ struct LineSearch {
   PD_HD bool accelerates() const { return jacobi && !plain_jacobi; }
 
   // Returns the momentum b of the next trial, which starts at u + b (u - before). `limit` is that of the Jacobi
-  // schedule. `corotated`: the direction has the coarse correction. `waits`: the coarse
+  // schedule. `corrected`: the direction has the coarse correction. `waits`: the coarse
   // problem is not built yet, and until then a rotating part may hardly move. `held`: it includes contacts.
-  PD_HD double propose(double limit, bool corotated, bool waits, bool held) {
+  PD_HD double propose(double limit, bool corrected, bool waits, bool held) {
     const bool extrapolates = accelerates() || !(learns || plain_jacobi);
     const double b = extrapolates ? extrapolation(jacobi ? limit : momentum_limit()) : 0;
     omega = plain_jacobi || jacobi ? 1 + b : 0;
-    const double whole = corotated ? full(held) : waits ? 0 : rotating_share;
-    share = {whole * material_fit * trial_length(), corotated ? coarse_kept : rotating_kept};
+    const double whole = corrected ? full(held) : waits ? 0 : rotating_share;
+    share = {whole * material_fit * trial_length(), corrected ? coarse_kept : rotating_kept};
     return b;
   }
 
