@@ -244,9 +244,9 @@ constexpr int part_slot_array = int(DevicePlanArray::part_slot);
 // Lengths of the arrays, by the names in gpu_plan.def.
 struct DevicePlanRows {
   std::int64_t size, vertex, pin, pinned_vertex, block, patch_end, patch, slot, shared_end,
-      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, part, level_end, sum, piece,
-      stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender, copied_vertex,
-      coupled_block;
+      shared_slot, stream_slot, piece_slot, part_patch_end, part_end, part_slot, part, level_end,
+      sum, piece, stored_block, rest_slot, fixed_slot, computed_block, computed_patch, sender,
+      copied_vertex, coupled_block;
 };
 
 // Whether the arrays of the stencils follow those of the plan; a plan with levels has none.

@@ -85,7 +85,7 @@ def test_a_plane_that_nothing_comes_near_changes_nothing(iterations: int, device
 def early(problem: StepProblem, displacement: Array, forces: Array | None = None) -> Array:
     """A displacement [V, 3] m as corrected before the iterations, from the forces [C, V, 3] N of contacts."""
     given = pushes_of(problem, displacement, problem.gradient(displacement)) if forces is None else forces
-    return correct(problem, displacement, given, early=True).displacement
+    return correct(problem, displacement, given).displacement
 
 
 def stretching(youngs: float, *planes: pd.Part, **options: Any) -> Case:

@@ -24,8 +24,9 @@ SLOT_STEP = 8  # slots in pair_corner
 KERNELS = BLOCK, CLUSTER, GRID, STREAM = range(4)
 MOST_CLUSTER = 16  # patches
 BOTH = [[0, 1, 2, 3], [0, 1, 2, 4]]  # the corners of both tetrahedra of a pair
-SIZES = ["kernel", "vertices", "tets", "pins", "pieces", "blocks", "patches", "slots", "shared", "parts", "senders"]
-SIZES += ["most_slots", "most_pairs", "most_entries", "most_interior", "members", "environments", "solid_pieces"]
+SIZES = ["kernel", "vertices", "tets", "pins", "pieces", "blocks", "patches", "slots", "shared", "parts", "sums"]
+SIZES += ["sum_levels", "senders", "most_slots", "most_pairs", "most_entries", "most_interior", "members"]
+SIZES += ["environments", "solid_pieces"]
 
 
 def delaunay_mesh() -> pd.TetMesh:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from cases import Case
-from device_plans import BLOCK, LANES, NONE, STREAM, Arrays, Lanes
+from device_plans import BLOCK, LANES, NONE, SIZES, STREAM, Arrays, Lanes
 from mixed_scenes import CASES, rod_case
 from numpy.typing import NDArray
 from sheets import cloth, surface
@@ -187,7 +187,7 @@ def test_every_entry_of_a_step_has_one_writer(built: tuple[Case, SceneValues, Ar
     np.testing.assert_array_equal(np.bincount(row, minlength=len(step)), step >> 16 & 32767)
     assert ((step ^ plan.slot_row.view(np.uint32)) >> 31 == 0).all()
     most = plan.row_sizes[ROW_SIZES["step_entries"]]
-    assert entry.max() < most <= plan.sizes[13]
+    assert entry.max() < most <= plan.sizes[SIZES.index("most_entries")]
 
 
 def test_float32_rows_are_as_near_as_stencils() -> None:

@@ -7,8 +7,9 @@ that pairs join. Elastic energy does not change, so q minimises
 
 with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
 An outer step minimises Phi with gaps and slips to first order, which is convex: Newton's steps, each ended by an exact
-search, and r moves toward friction l in between. The outer step halves the motion until Phi has not risen. The pushes p
-of the touching vertices follow, contact by contact. At a converged step q = 0 and p = 0.
+search, and r moves toward friction l in between. The outer step halves the motion until Phi has not risen; a small one
+is the last, unchecked. The pushes p of the touching vertices follow, contact by contact. At a converged step q = 0 and
+p = 0.
 """
 
 from __future__ import annotations
@@ -39,9 +40,8 @@ OUTER = 10  # finite motions
 PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
 HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-STILL = 1e-7  # of the size of a body: a step that may be left
+STILL = 1e-7  # of the size of a body: a motion that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
-EARLY = 1e-3  # both, before the iterations
 SETTLED = 0.1  # of a motion: a next step that ends it, once friction radii follow; of these: a lag made up at once
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
@@ -220,7 +220,6 @@ def correct(
     pairs: PairContacts | None = None,
     *,
     motions: MotionsOf = RigidMotions,
-    early: bool = False,
 ) -> Correction:
     """The coarse correction of every island.
 
@@ -230,7 +229,6 @@ def correct(
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
         motions: makes the motions of an island.
-        early: whether iterations go on from it, so that it may end sooner.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
     energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
@@ -238,7 +236,7 @@ def correct(
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, push, each, energy = _correct_island(moving, forces, own, early)
+        corrected, push, each, energy = _correct_island(moving, forces, own)
         pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
         energies[problem.values.component[[body[0] for body in bodies]]] = energy
@@ -259,17 +257,18 @@ def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[t
 
 
 def _correct_island(
-    motions: Motions, forces: Array, pairs: PairContacts | None, early: bool
+    motions: Motions, forces: Array, pairs: PairContacts | None
 ) -> tuple[Array, Array, Array, float]:
     """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
     contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
     radius = contacts.friction * contacts.normal_anchors
-    still, behind = (EARLY, EARLY) if early else (STILL, LAG)
     phi = motions.energy + contacts.energy(radius)
     for _ in range(OUTER):
-        motion, radius = _model_minimum(motions, contacts, radius, still, behind)
-        if not motion.any():
+        motion, radius = _model_minimum(motions, contacts, radius)
+        if motions.share(motion) <= STILL:
+            motions = motions.after(motion)
+            contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
             break
         energy = motions.energy + contacts.energy(radius)
         for _ in range(CUTS + 1):
@@ -286,14 +285,11 @@ def _correct_island(
     return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
-def _model_minimum(
-    motions: Motions, contacts: Envelopes, radius: Array, still: float, behind: float
-) -> tuple[Array, Array]:
+def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
     """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
 
     Newton's steps, each ended where the model is least along it. Where the next one is small beside the motion, radii
-    go half way to friction l, unless they are near: what friction does to normal forces may drive them up and down. No
-    motion where the first step is small.
+    go half way to friction l, unless they are near: what friction does to normal forces may drive them up and down.
     """
     gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
     motion = np.zeros(len(gradient))
@@ -306,11 +302,11 @@ def _model_minimum(
         force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion
         # a line has no inertia about itself
         step = np.linalg.lstsq(matrix, force, rcond=1e-12)[0]
-        if motions.share(step) <= max(still, SETTLED * motions.share(motion)):
+        if motions.share(step) <= max(STILL, SETTLED * motions.share(motion)):
             lag = contacts.friction * trial.normal_forces() - radius
             left, size = np.linalg.norm(lag), np.linalg.norm(radius)
-            if left <= behind * size:
-                motion = motion + step if motion.any() else motion
+            if left <= LAG * size:
+                motion = motion + step
                 break
             radius = radius + (1.0 if left <= SETTLED * size else 0.5) * lag
             continue

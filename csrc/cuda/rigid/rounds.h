@@ -108,11 +108,11 @@ PD_DEVICE double write_shares(const double (&value)[Count], double* to) {
 }
 
 // The numbers that a round sums, in their order in PartSums.
-struct Range {
+struct RowNumbers {
   int begin, end;
 
   template <class T>
-  PD_DEVICE Range(Round what, const DevicePlan<T>& plan)
+  PD_DEVICE RowNumbers(Round what, const DevicePlan<T>& plan)
       : begin(what == Round::moments && !has_whole_parts(plan) ? RigidSums::target_offset : 0),
         end(what == Round::mean       ? RigidSums::target_offset
             : what == Round::moments  ? RigidSums::count
@@ -123,12 +123,12 @@ struct Range {
 
 // Lane n gets the sum of number n over rows. It bypasses the L1 cache, which may not hold the writes
 // of other blocks.
-PD_DEVICE_COLD double sum_over_rows(Range range, const double* row, int begin, int end) {
+PD_DEVICE_COLD double sum_over_rows(RowNumbers numbers, const double* row, int begin, int end) {
   const int lane = int(threadIdx.x) % warp_size;
   double own = 0;
 #pragma unroll 8
   for (int at = begin; at < end; ++at) {
-    if (range.has(lane)) own += __ldcg(row + std::int64_t(at) * PartSums::count + lane);
+    if (numbers.has(lane)) own += __ldcg(row + std::int64_t(at) * PartSums::count + lane);
   }
   return own;
 }
@@ -136,10 +136,10 @@ PD_DEVICE_COLD double sum_over_rows(Range range, const double* row, int begin, i
 // Sum n of a tree. `row`: [count_rows, PartSums::count]
 template <Round What, class T>
 PD_DEVICE void sum_rows(const DevicePlan<T>& plan, int n, double* row) {
-  const Range range(What, plan);
+  const RowNumbers numbers(What, plan);
   const int lane = int(threadIdx.x) % warp_size;
-  const double own = sum_over_rows(range, row, plan.sum_rows[2 * n], plan.sum_rows[2 * n + 1]);
-  if (range.has(lane)) row[(std::int64_t(plan.parts) + n) * PartSums::count + lane] = own;
+  const double own = sum_over_rows(numbers, row, plan.sum_rows[2 * n], plan.sum_rows[2 * n + 1]);
+  if (numbers.has(lane)) row[(std::int64_t(plan.parts) + n) * PartSums::count + lane] = own;
 }
 
 // The rounds that find the motions of all pieces. `run` takes the sums of a round, and knows whether
@@ -216,25 +216,27 @@ PD_DEVICE_COLD void sum_part(const Correction<T, HasContacts>& of, const DeviceP
   }
 }
 
-// `row`: [count_rows, PartSums::count]. A warp for a piece. `early`: before the iterations.
+// `row`: [count_rows, PartSums::count]. A warp for a piece.
 template <Round What, class T>
-PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts, bool early,
+PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts,
                                const double* row, Piece& to) {
   const int lane = int(threadIdx.x) % warp_size;
   if constexpr (What == Round::contacts) {
     if (to.body.is_done()) return;
   }
-  const Range range(What, plan);
+  const RowNumbers numbers(What, plan);
   const int* of = plan.piece_rows + 2 * piece;
-  const double own = sum_over_rows(range, row, of[0], of[1]);
-  double* const total = What == Round::contacts ? to.contact : What == Round::rises ? &to.rise : to.sum;
-  if (range.has(lane)) total[lane] = own;
+  const double own = sum_over_rows(numbers, row, of[0], of[1]);
+  double* const total = What == Round::contacts ? to.contact
+                        : What == Round::rises  ? &to.rise
+                                                : to.sum;
+  if (numbers.has(lane)) total[lane] = own;
   __syncwarp();
   if (lane != 0) return;
   if constexpr (What == Round::moments) {
     to.reached = to.body.reached();
     to.motion_before = to.body.motion();
-    to.body = CoarseBody(RigidBody(to.sum), early);
+    to.body = CoarseBody(RigidBody(to.sum));
     for (double& sum : to.contact) sum = 0;
     while (!has_contacts && !to.body.is_done()) to.body.pass(to.contact);
   } else if constexpr (What == Round::contacts) {

@@ -49,7 +49,7 @@ class StreamRounds {
       team_.barrier();
     }
     for (int n = team_.warp(); n < w_.plan.pieces; n += team_.warps())
-      move_piece<What>(w_.plan, n, HasContacts, of_.is_early(), w_.part_sums(), w_.piece(n));
+      move_piece<What>(w_.plan, n, HasContacts, w_.part_sums(), w_.piece(n));
     team_.barrier();
   }
 

@@ -268,8 +268,8 @@ void add_sums(DeviceMeshPlan& plan, const std::vector<std::int32_t>& part_piece,
   std::vector<std::int32_t> start(pieces + 1, 0);
   for (const std::int32_t number : part_piece) ++start[number + 1];
   std::partial_sum(start.begin(), start.end(), start.begin());
-  std::vector<std::int32_t> begin(start.begin(), start.end() - 1), next = begin,
-                            end(start.begin() + 1, start.end());
+  std::vector<std::int32_t> begin(start.begin(), start.end() - 1),
+      next = begin, end(start.begin() + 1, start.end());
   for (const std::int32_t number : part_piece) plan.part_row.push_back(next[number]++);
   const auto is_wide = [&](std::int32_t p) { return end[p] - begin[p] > most_children; };
   std::int32_t rows = std::int32_t(part_piece.size());
@@ -280,8 +280,7 @@ void add_sums(DeviceMeshPlan& plan, const std::vector<std::int32_t>& part_piece,
       if (!is_wide(p)) continue;
       const std::int32_t first = rows;
       for (std::int32_t child = begin[p]; child < end[p]; child += most_children, ++rows)
-        plan.sum_rows.insert(plan.sum_rows.end(),
-                             {child, std::min(child + most_children, end[p])});
+        plan.sum_rows.insert(plan.sum_rows.end(), {child, std::min(child + most_children, end[p])});
       begin[p] = first;
       end[p] = rows;
       wide = true;

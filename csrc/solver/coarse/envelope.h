@@ -218,7 +218,8 @@ PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
       contacts, v.inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
         const Surface<W> at = before_pushes(surface_at(shape, v.x, v.u + push), later);
         const Envelope<W> envelope(v.stiffness, forces.force(n), at.normal);
-        push = push + v.inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
+        push =
+            push + v.inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
       });
   return push;
 }

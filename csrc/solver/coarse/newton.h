@@ -3,8 +3,8 @@
 //
 // Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each
 // ended where Phi is least along it. Where the next one is small beside the motion, radii of friction go half way to friction
-// times l, or all the way if they are near. The motion is halved until Phi itself has not risen. The passes end where no step
-// is left. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
+// times l, or all the way if they are near. The motion is halved until Phi itself has not risen. They end with a motion that is
+// small. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
 #include "solver/coarse/sums.h"
@@ -21,10 +21,8 @@ struct RigidMotion {
 };
 
 constexpr int most_motions = 10, most_steps = 12, most_cuts = 8, most_searches = 30;
-// Of the size of a body: a step that is left. Of the radii: how far behind friction l they may be left.
+// Of the size of a body: a motion that ends the passes. Of the radii: how far behind friction l they may be left.
 constexpr double still_share = 1e-7, lag_share = 1e-6;
-// The same of both, before the iterations.
-constexpr double early_share = 1e-3;
 // Of a motion: a next step with which it ends, once radii have followed. Of these: a lag that they make up at once.
 constexpr double settled_share = 0.1;
 // Of the energy that moves a body by its size: a rise that is rounding.
@@ -54,11 +52,7 @@ class CoarseBody {
  public:
   CoarseBody() = default;
 
-  // `early`: before the iterations, which go on from it.
-  PD_HD CoarseBody(const RigidBody& body, bool early)
-      : body_(body),
-        still_(early ? early_share : still_share),
-        lag_(early ? early_share : lag_share) {
+  PD_HD explicit CoarseBody(const RigidBody& body) : body_(body) {
     size_ = square_root(body.square);
     length_ = size_ > 0 ? 1.0 / size_ : 1.0;
     accepted_ = trial_ = {{}, body.center, {0, 0, 0}};
@@ -68,8 +62,8 @@ class CoarseBody {
   PD_HD bool moves() const { return body_.weight > 0 && body_.hold != Hold::all; }
   PD_HD bool is_done() const { return done_; }
   PD_HD const RigidMotion<double>& motion() const { return accepted_; }
-  // Phi there, the quadratics relative to no motion
-  PD_HD double reached() const { return energy(accepted_) + contact_energy_; }
+  // Phi before the last small motion, the quadratics relative to no motion
+  PD_HD double reached() const { return reached_; }
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
@@ -77,7 +71,7 @@ class CoarseBody {
             trial_.shift,   finite_ ? 1.0 : 0.0, renews_};
   }
 
-  PD_HD void pass(const double (&sum)[ContactSums::count]) {
+  PD_CALLED void pass(const double (&sum)[ContactSums::count]) {
     if (finite_ && !accept(sum)) return;
     double terms[terms_count];
     find_terms(sum, terms);
@@ -109,7 +103,7 @@ class CoarseBody {
       return false;
     }
     accepted_ = trial_;
-    contact_energy_ = sum[S::after];
+    reached_ = after;
     done_ = ++motions_ > most_motions;
     if (done_) return false;
     find_quadratics();
@@ -143,22 +137,27 @@ class CoarseBody {
     return false;
   }
 
-  // From the terms at the twist: Newton's next step; where that is small, radii are renewed, or it ends the motion.
+  // From the terms at the twist: Newton's next step; where that is small, radii are renewed, or it ends the motion. A small
+  // motion needs no pass, and is the last.
   PD_HD void decide(double (&terms)[terms_count], double lag, double radius) {
+    const double moved = length_of(twist_), least = still_share * size_,
+                 part = settled_share * moved;
     renews_ = 0;
-    if (++steps_ > most_steps) return try_motion();
-    solve(terms);
-    searches_ = 0;
-    low_ = 0, high_ = share_ = 1;
-    const double moved = length_of(twist_), least = still_ * size_, part = settled_share * moved;
-    if (length_of(step_) > (least > part ? least : part)) return try_step();
-    if (lag <= lag_ * lag_ * radius) {
-      for (int i = 0; i < 6 && moved > 0; ++i) twist_[i] += step_[i];
-      return try_motion();
+    if (++steps_ <= most_steps) {
+      solve(terms);
+      searches_ = 0;
+      low_ = 0, high_ = share_ = 1;
+      if (length_of(step_) > (least > part ? least : part)) return try_step();
+      if (lag > lag_share * lag_share * radius) {
+        renews_ = lag <= settled_share * settled_share * radius ? 1.0 : 0.5;
+        share_ = 0;  // a pass at the twist
+        return try_step();
+      }
+      for (int i = 0; i < 6; ++i) twist_[i] += step_[i];
     }
-    renews_ = lag <= settled_share * settled_share * radius ? 1.0 : 0.5;
-    share_ = 0;  // a pass at the twist
-    try_step();
+    try_motion();
+    done_ = length_of(twist_) <= least;
+    if (done_) accepted_ = trial_;
   }
 
   PD_HD static double length_of(const double (&twist)[6]) {
@@ -174,10 +173,9 @@ class CoarseBody {
     set_trial(at, cross_matrix(turn_of(at)));
   }
 
-  // The finite trial, unless no motion is left.
+  // The finite trial.
   PD_HD void try_motion() {
     finite_ = true;
-    done_ = length_of(twist_) == 0;
     set_trial(twist_, small_turn(turn_of(twist_)));
   }
 
@@ -249,8 +247,8 @@ class CoarseBody {
       force = multiply_add(terms[at(6, 3 + r)], axis[r], force);
       PD_UNROLL
       for (int c = 0; c < 3; ++c)
-        along = multiply_add(terms[c < r ? at(3 + r, 3 + c) : at(3 + c, 3 + r)],
-                             axis[r] * axis[c], along);
+        along = multiply_add(terms[c < r ? at(3 + r, 3 + c) : at(3 + c, 3 + r)], axis[r] * axis[c],
+                             along);
     }
     PD_UNROLL
     for (int r = 0; r <= 6; ++r) {
@@ -279,7 +277,8 @@ class CoarseBody {
       for (int c = j + 1; c < 6; ++c) {
         const double factor = inverse[j] * a[at(c, j)];
         PD_UNROLL
-        for (int r = c; r <= 6; ++r) a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
+        for (int r = c; r <= 6; ++r)
+          a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
       }
     }
     PD_UNROLL
@@ -295,10 +294,9 @@ class CoarseBody {
   RigidMotion<double> accepted_, trial_;
   Mat3<double> second_;
   Vec3<double> force_, moment_;
-  double still_, lag_;    // of the size, and of the radii: that may be left
   double size_, length_;  // length_: 1 / size_
   double twist_[6] = {}, step_[6] = {}, share_ = 0, low_ = 0, high_ = 1;
-  double contact_energy_ = 0;
+  double reached_ = 0;
   int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
   double renews_ = 0;  // share by which the pass moves radii toward friction l
   bool finite_ = true, done_ = true;
