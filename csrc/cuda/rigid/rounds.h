@@ -123,7 +123,8 @@ struct RowNumbers {
 
 // Lane n gets the sum of number n over rows. It bypasses the L1 cache, which may not hold the writes
 // of other blocks.
-PD_DEVICE_COLD double sum_over_rows(RowNumbers numbers, const double* row, int begin, int end) {
+inline PD_DEVICE_COLD double sum_over_rows(RowNumbers numbers, const double* row, int begin,
+                                           int end) {
   const int lane = int(threadIdx.x) % warp_size;
   double own = 0;
 #pragma unroll 8
