@@ -39,7 +39,8 @@ Index = NDArray[np.int64]
 OUTER = 10  # finite motions
 PASSES = 12  # Newton's steps to one of them
 CUTS = 8  # of a step that raises Phi
-HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
+ONE_POINT = 1e-6  # of their distance from the origin, which float32 rounds: how far pins at one point are apart
+ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
 STILL = 1e-7  # of the size of a body: a motion that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
 SETTLED = 0.1  # of a motion: a next step that ends it, once friction radii follow; of these: a lag made up at once
@@ -124,10 +125,12 @@ class RigidMotions(Motions):
             return (weight * y).sum(axis=0) / weight.sum(), np.eye(6)
         # about the mean of the pins: what they leave free are turns alone
         centre = y[~free].mean(axis=0)
-        lengths = np.repeat([1.0, float(np.linalg.norm(y - centre, axis=1).max())], 3)
-        pinned = twists(y[~free] - centre).reshape(-1, 6) / lengths
-        values, vectors = np.linalg.eigh(pinned.T @ pinned / int((~free).sum()))
-        return centre, vectors[:, values < HELD] / lengths[:, None]
+        arms = y[~free] - centre
+        apart, axes = np.linalg.eigh(arms.T @ arms / len(arms))
+        turns = axes
+        if apart[2] > ONE_POINT**2 * float(centre @ centre):
+            turns = axes[:, 2:] if apart[1] <= ONE_LINE**2 * apart[2] else axes[:, :0]
+        return centre, np.concatenate([np.zeros_like(turns), turns])
 
     @cached_property
     def parts(self) -> list[tuple[Index, Array, Array, slice, slice]]:
