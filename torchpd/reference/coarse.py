@@ -6,10 +6,9 @@ that pairs join. Elastic energy does not change, so q minimises
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
 with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
-An outer step minimises Phi with gaps and slips to first order, which is convex: Newton's steps, each ended by an exact
-search, and r moves toward friction l in between. The outer step halves the motion until Phi has not risen; a small one
-is the last, unchecked. The pushes p of the touching vertices follow, contact by contact. At a converged step q = 0 and
-p = 0.
+Newton's steps, each a finite motion, shortened where Phi rises or has turned upward; in between, r moves toward friction l.
+The last step is small, and unchecked. The pushes p of the touching vertices follow, contact by contact. At a converged
+step q = 0 and p = 0.
 """
 
 from __future__ import annotations
@@ -36,14 +35,13 @@ __all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "isl
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-OUTER = 10  # finite motions
-PASSES = 12  # Newton's steps to one of them
-CUTS = 8  # of a step that raises Phi
+PASSES = 64  # states at which Phi is looked at
 ONE_POINT = 1e-6  # of their distance from the origin, which float32 rounds: how far pins at one point are apart
 ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
-STILL = 1e-7  # of the size of a body: a motion that ends the passes
+STILL = 1e-7  # of the size of a body: a step that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
-SETTLED = 0.1  # of a motion: a next step that ends it, once friction radii follow; of these: a lag made up at once
+SETTLED = 0.1  # of the motion since radii moved: a step with which they move again; of them: a lag made up at once
+FLAT = 0.5  # of the slope of Phi at the start of a step: an upward one at its end
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
@@ -95,6 +93,10 @@ class Motions(ABC):
     @abstractmethod
     def after(self, motion: Array) -> Self:
         """The same after motions [N]; hard pins stay."""
+
+    def way(self, motion: Array) -> Array:
+        """Motions [N] here by which a share of `motion`, which led here, changes."""
+        return motion
 
     @property
     @abstractmethod
@@ -196,6 +198,14 @@ class RigidMotions(Motions):
             displacement[own] += _finite(basis @ motion[columns], arms)
         return replace(self, displacement=displacement)
 
+    def way(self, motion: Array) -> Array:
+        way = motion.copy()
+        for _, _, basis, _, columns in self.parts:
+            turn = (basis @ motion[columns])[3:]
+            # about the axis of the turn; a body with pins only turns
+            way[columns][-3:] *= 1.0 / (1.0 + 0.25 * float(turn @ turn))
+        return way
+
     @property
     def energy(self) -> float:
         """sum a / 2 |u - s|^2 [J] of the free vertices of the island."""
@@ -264,75 +274,59 @@ def _correct_island(
 ) -> tuple[Array, Array, Array, float]:
     """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
-    contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
+
+    def contacts_of(motions: Motions) -> Envelopes:
+        return contacts_at(problem, motions.displacement, forces, vertices, pairs)
+
+    contacts = contacts_of(motions)
     radius = contacts.friction * contacts.normal_anchors
-    phi = motions.energy + contacts.energy(radius)
-    for _ in range(OUTER):
-        motion, radius = _model_minimum(motions, contacts, radius)
-        if motions.share(motion) <= STILL:
-            motions = motions.after(motion)
-            contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
-            break
-        energy = motions.energy + contacts.energy(radius)
-        for _ in range(CUTS + 1):
-            trial = motions.after(motion)
-            after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
-            way = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
-            reached = trial.energy + replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
-            if reached <= energy + ROUNDING * (motions.scale + energy):
+    phi, moved, left = motions.energy + contacts.energy(radius), 0.0, PASSES - 1
+    while True:
+        hessian, force = _newton_terms(motions, contacts, radius)
+        # a line has no inertia about itself
+        step = np.linalg.lstsq(hessian, force, rcond=1e-12)[0]
+        length = motions.share(step)
+        lag = contacts.friction * contacts.normal_forces() - radius
+        lagging, size = float(np.linalg.norm(lag)), float(np.linalg.norm(radius))
+        if lagging > LAG * size and length <= max(STILL, SETTLED * moved):
+            if not left:
                 break
-            motion = 0.5 * motion
+            left -= 1
+            radius, moved = radius + (1.0 if lagging <= SETTLED * size else 0.5) * lag, 0.0
+            continue
+        if lagging <= LAG * size and length <= STILL:
+            motions = motions.after(step)
+            contacts = contacts_of(motions)
+            break
+        share, energy = 1.0, motions.energy + contacts.energy(radius)
+        rounding = ROUNDING * (motions.scale + contacts.energy(radius))
+        while left:
+            left -= 1
+            trial = motions.after(share * step)
+            there = contacts_of(trial)
+            moves = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
+            # by the normals of before, so that both energies are of one function
+            reached = trial.energy + replace(contacts.shifted(moves), gaps=there.gaps).energy(radius)
+            second, down = _newton_terms(trial, there, radius)
+            way = trial.way(share * step) / share
+            slope = -float(down @ way)
+            if reached <= energy + rounding and slope <= FLAT * float(force @ step):
+                break
+            # Newton's step from there, or half of it
+            nearer = share - slope / float(way @ second @ way)
+            share = nearer if 0.0 < nearer < share else 0.5 * share
         else:
             break
-        motions, contacts, phi = trial, after, reached
+        motions, contacts, phi, moved = trial, there, reached, moved + share * length
     return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
-def _model_minimum(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
-    """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
-
-    Newton's steps, each ended where the model is least along it. Where the next one is small beside the motion, radii
-    go half way to friction l, unless they are near: what friction does to normal forces may drive them up and down.
-    """
-    gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
-    motion = np.zeros(len(gradient))
-
-    for _ in range(PASSES):
-        trial = contacts.shifted(jacobian @ motion)
-        second = trial.majoriser(radius)
-        on = second.any(axis=(1, 2))
-        matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-        force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion
-        # a line has no inertia about itself
-        step = np.linalg.lstsq(matrix, force, rcond=1e-12)[0]
-        if motions.share(step) <= max(STILL, SETTLED * motions.share(motion)):
-            lag = contacts.friction * trial.normal_forces() - radius
-            left, size = np.linalg.norm(lag), np.linalg.norm(radius)
-            if left <= LAG * size:
-                motion = motion + step
-                break
-            radius = radius + (1.0 if left <= SETTLED * size else 0.5) * lag
-            continue
-        way, linear, quadratic = jacobian @ step, float(force @ step), float(step @ hessian @ step)
-        linear -= float((way * trial.forces(radius)).sum())
-
-        def slope(
-            share: float,
-            trial: Envelopes = trial,
-            way: Array = way,
-            linear: float = linear,
-            quadratic: float = quadratic,
-            radius: Array = radius,
-        ) -> float:
-            return share * quadratic - linear - float((way * trial.shifted(share * way).forces(radius)).sum())
-
-        low, high = 0.0, 1.0
-        if slope(1.0) > 1e-9 * abs(slope(0.0)):
-            for _ in range(30):
-                middle = 0.5 * (low + high)
-                low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
-        motion = motion + high * step
-    return motion, radius
+def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """The second derivative [N, N] of Phi by the motions, and minus the first [N]."""
+    jacobian, second = motions.jacobian(contacts), contacts.majoriser(radius)
+    on = second.any(axis=(1, 2))
+    matrix = motions.hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
+    return matrix, np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:

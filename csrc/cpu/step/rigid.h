@@ -115,7 +115,6 @@ bool set_trial(Workspace<Lanes>& w, int g) {
     put_lane<Lanes>(to.center, lane, from.center);
     put_lane<Lanes>(to.shift_before, lane, from.shift_before);
     put_lane<Lanes>(to.shift_after, lane, from.shift_after);
-    put_lane<Lanes>(to.finite, lane, from.finite);
     put_lane<Lanes>(to.renews, lane, body.is_done() ? 0.0 : from.renews);
   }
   return goes_on;

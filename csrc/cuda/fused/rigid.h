@@ -44,8 +44,10 @@ class FusedRounds {
         sum_rows<What>(plan, n, part_sums);
       sums.sync();
     }
-    for (int n = warp; n < plan.pieces; n += warps)
-      move_piece<What>(plan, n, of.contacts.exist(), part_sums, pieces[n]);
+    for (int n = warp; n < plan.pieces; n += warps) sum_piece<What>(plan, n, part_sums, pieces[n]);
+    __syncthreads();
+    for (int n = threadIdx.x; n < plan.pieces; n += blockDim.x)
+      move_piece<What>(plan, n, of.contacts.exist(), pieces[n]);
     __syncthreads();
   }
 
