@@ -6,9 +6,9 @@ that pairs join. Elastic energy does not change, so q minimises
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
 with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
-Newton's steps, each a finite motion, shortened where Phi rises or has turned upward; in between, r moves toward friction l.
-The last step is small, and unchecked. The pushes p of the touching vertices follow, contact by contact. At a converged
-step q = 0 and p = 0.
+Newton's steps, each a finite motion, shortened where Phi rises or has turned upward; in between, r moves toward friction
+l. The last step is small, and unchecked. The pushes p of the touching vertices follow, contact by contact. At a
+converged step q = 0 and p = 0.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ __all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "isl
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-PASSES = 64  # states at which Phi is looked at
-ONE_POINT = 1e-6  # of their distance from the origin, which float32 rounds: how far pins at one point are apart
+PASSES = 1024  # states at which Phi is looked at
+ONE_POINT = 1e-6  # of their body's size and distance from the origin, which float32 rounds: how far pins at a point are apart
 ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
 STILL = 1e-7  # of the size of a body: a step that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
@@ -129,8 +129,11 @@ class RigidMotions(Motions):
         centre = y[~free].mean(axis=0)
         arms = y[~free] - centre
         apart, axes = np.linalg.eigh(arms.T @ arms / len(arms))
+        weight = np.where(free, self.problem.weight[body], 0.0)[:, None]
+        total = float(weight.sum()) or 1.0
+        square = float((weight * (y - (weight * y).sum(axis=0) / total) ** 2).sum() / total)
         turns = axes
-        if apart[2] > ONE_POINT**2 * float(centre @ centre):
+        if apart[2] > ONE_POINT**2 * (square + float(centre @ centre)):
             turns = axes[:, 2:] if apart[1] <= ONE_LINE**2 * apart[2] else axes[:, :0]
         return centre, np.concatenate([np.zeros_like(turns), turns])
 

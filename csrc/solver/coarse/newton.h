@@ -19,7 +19,7 @@ struct RigidMotion {
   PD_HD Vec3<T> of(const Vec3<T>& y) const { return turn * (y - center) + shift; }
 };
 
-constexpr int most_passes = 64;
+constexpr int most_passes = 1024;
 // Of the size of a body: a step that ends the passes. Of the radii: how far behind friction l they may be left.
 constexpr double still_share = 1e-7, lag_share = 1e-6;
 // Of the motion since radii moved: a step with which they move again. Of these: a lag that they make up at once.

@@ -68,8 +68,8 @@ PD_HD Mat3<double> symmetric(const double* s) {
 
 PD_HD double trace(const Mat3<double>& a) { return (a.row[0].x + a.row[1].y) + a.row[2].z; }
 
-// Pins lie at one point that are no further apart than this share of their distance from the origin, which float32 rounds;
-// and on one line that are no further from it than this share of what they are apart.
+// Pins lie at one point that are no further apart than this share of their body's size and distance from the origin, which
+// float32 rounds; and on one line that are no further from it than this share of what they are apart.
 constexpr double one_point = 1e-6, one_line = 1e-4;
 
 // What pins leave to a body.
@@ -109,9 +109,9 @@ struct RigidBody {
     for (int r = 0; r < 3; ++r) spread.row[r] = subtract_product(spread.row[r], mean[r], pivot);
     const SignedSvd<double> svd = signed_svd(spread);
     const Vec3<double> at_pins = center + pivot;
-    hold = !(svd.s[0] > one_point * one_point * dot(at_pins, at_pins)) ? Hold::point
-           : svd.s[1] > one_line * one_line * svd.s[0]                 ? Hold::all
-                                                                       : Hold::line;
+    hold = !(svd.s[0] > one_point * one_point * (square + dot(at_pins, at_pins))) ? Hold::point
+           : svd.s[1] > one_line * one_line * svd.s[0]                            ? Hold::all
+                                                                                  : Hold::line;
     axis = {svd.u.row[0].x, svd.u.row[1].x, svd.u.row[2].x};
     // arms are longer by -pivot: sum a r = -W pivot
     const double out[3] = {pull.x, pull.y, pull.z};
