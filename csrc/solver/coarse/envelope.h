@@ -218,43 +218,36 @@ PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
       contacts, v.inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
         const Surface<W> at = before_pushes(surface_at(shape, v.x, v.u + push), later);
         const Envelope<W> envelope(v.stiffness, forces.force(n), at.normal);
-        push = push + v.inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
+        push =
+            push + v.inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
       });
   return push;
 }
 
-// What a round asks of a body's vertices, per environment: the accepted motion and the trial, a finite motion, or to first
-// order a twist about the moved centre. `renews`: the share by which radii move toward friction l.
+// What a round asks of a body's vertices, per environment: the accepted motion and the trial. `renews`: the share by which
+// radii move toward friction l.
 template <class W>
 struct CoarseTrial {
-  Mat3<W> turn_before, turn_after;  // R - I; to first order [w]x R
+  Mat3<W> turn_before, turn_after;  // R - 1
   Vec3<W> center, shift_before, shift_after;
-  W finite, renews;  // 1 or 0; 1, 0.5 or 0
+  W renews;  // 1, 0.5 or 0
 };
 
 // Calls add(whether a contact of a vertex adds anything, what it adds: a function).
 template <class R, class W, class Forces, class Add>
 PD_HD void each_contact_term(const Contacts<R>& contacts, const CoarseVertex<W>& v,
                              const CoarseTrial<W>& trial, const Forces& forces, const Add& add) {
-  const Vec3<W> arm = (v.x + v.u) - trial.center, turned = trial.turn_before * arm;
-  const Vec3<W> first = v.u + (turned + trial.shift_before);
-  const Vec3<W> way = trial.turn_after * arm, then = v.u + (way + trial.shift_after);
+  const Vec3<W> arm = (v.x + v.u) - trial.center, way = trial.turn_after * arm;
+  const Vec3<W> first = v.u + (trial.turn_before * arm + trial.shift_before);
+  const Vec3<W> then = v.u + (way + trial.shift_after);
   const W none(0.0);
-  const auto finite = trial.finite > none;
-  const Vec3<W> lever = arm + select(finite, way, turned), moved = then - first;
   each_contact_in_turn<W>(
       contacts, v.inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
-        const Surface<W> before = before_pushes(surface_at(shape, v.x, first), later);
+        const Surface<W> before = before_pushes(surface_at(shape, v.x, first), later),
+                         after = before_pushes(surface_at(shape, v.x, then), later);
         // by the normal of before, so that both energies are of one function
-        Surface<W> there = {before.normal, before.gap + dot(before.normal, moved),
-                            before.slip + tangential(moved, before.normal)};
-        Surface<W> after = there;
-        if (any(finite)) {
-          const Surface<W> at = before_pushes(surface_at(shape, v.x, then), later);
-          there.gap = select(finite, at.gap, there.gap);
-          after = {select(finite, at.normal, there.normal), there.gap,
-                   select(finite, at.slip, there.slip)};
-        }
+        const Surface<W> there = {before.normal, after.gap,
+                                  before.slip + tangential(then - first, before.normal)};
         const Vec3<W> force = forces.force(n);
         const W last_radius = forces.radius(n);
         const Envelope<W> old(v.stiffness, force, before.normal),
@@ -262,11 +255,9 @@ PD_HD void each_contact_term(const Contacts<R>& contacts, const CoarseVertex<W>&
         const W normal = now.normal_force(after.gap);
         const W size = ((old.normal_force(before.gap) + normal) + last_radius) + dot(force, force);
         add(any(size > none), [&] {
-          ContactTerms<W> terms{};  // first-order passes need no energies
-          if (any(finite)) {
-            terms.before = v.inverse * old.energy(before, last_radius);
-            terms.after = v.inverse * old.energy(there, last_radius);
-          }
+          ContactTerms<W> terms;
+          terms.before = v.inverse * old.energy(before, last_radius);
+          terms.after = v.inverse * old.energy(there, last_radius);
           const W free = select(v.stiffness > none, W(1.0), none);
           const W radius =
               multiply_add(trial.renews, shape.friction * normal - last_radius, last_radius);
@@ -274,7 +265,7 @@ PD_HD void each_contact_term(const Contacts<R>& contacts, const CoarseVertex<W>&
           terms.lag = free * (shape.friction * normal - radius);
           terms.radius = free * radius;
           const auto rub = now.rub(after.slip, radius);
-          terms.arm = lever;
+          terms.arm = arm + way;
           terms.normal = after.normal;
           terms.force = free * multiply_add(normal, after.normal, rub.share * rub.pull);
           terms.across = rub.share * v.stiffness;
