@@ -6,9 +6,9 @@ that pairs join. Elastic energy does not change, so q minimises
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
 with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
-Newton's steps, each a finite motion, shortened where Phi rises or has turned upward; in between, r moves toward friction
-l. The last step is small, and unchecked. The pushes p of the touching vertices follow, contact by contact. At a
-converged step q = 0 and p = 0.
+Newton's steps, each a finite motion, shortened where Phi rises or has turned upward. In between, r moves toward
+friction l. The last step is small, and unchecked. The pushes p of the touching vertices follow, contact by contact. At
+a converged step q = 0 and p = 0.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 PASSES = 1024  # states at which Phi is looked at
-ONE_POINT = 1e-6  # of their body's size and distance from the origin, which float32 rounds: how far pins at a point are apart
+ONE_POINT = 1e-6  # of a body's size and distance from the origin, which float32 rounds: how far pins at a point lie apart
 ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
 STILL = 1e-7  # of the size of a body: a step that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
@@ -272,9 +272,7 @@ def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[t
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(
-    motions: Motions, forces: Array, pairs: PairContacts | None
-) -> tuple[Array, Array, Array, float]:
+def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, Array, float]:
     """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
 
@@ -307,7 +305,9 @@ def _correct_island(
             left -= 1
             trial = motions.after(share * step)
             there = contacts_of(trial)
-            moves = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
+            moves = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(
+                1
+            )
             # by the normals of before, so that both energies are of one function
             reached = trial.energy + replace(contacts.shifted(moves), gaps=there.gaps).energy(radius)
             second, down = _newton_terms(trial, there, radius)
