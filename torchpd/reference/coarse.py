@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 PASSES = 1024  # states at which Phi is looked at
-ONE_POINT = 1e-6  # of a body's size and distance from the origin, which float32 rounds: how far pins at a point lie apart
+ONE_POINT = 1e-6  # of a body's size and distance from the origin, which float32 rounds: pins so near lie at a point
 ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
 STILL = 1e-7  # of the size of a body: a step that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
