@@ -285,7 +285,7 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
     while True:
         hessian, force = _newton_terms(motions, contacts, radius)
         # a line has no inertia about itself
-        step = np.linalg.lstsq(hessian, force, rcond=1e-12)[0]
+        step: Array = np.asarray(np.linalg.lstsq(hessian, force, rcond=1e-12)[0], np.float64)
         length = motions.share(step)
         lag = contacts.friction * contacts.normal_forces() - radius
         lagging, size = float(np.linalg.norm(lag)), float(np.linalg.norm(radius))
@@ -305,9 +305,8 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
             left -= 1
             trial = motions.after(share * step)
             there = contacts_of(trial)
-            moves = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(
-                1
-            )
+            moved_by = (trial.displacement - motions.displacement)[contacts.vertices]
+            moves = (contacts.weights[:, :, None] * moved_by).sum(axis=1)
             # by the normals of before, so that both energies are of one function
             reached = trial.energy + replace(contacts.shifted(moves), gaps=there.gaps).energy(radius)
             second, down = _newton_terms(trial, there, radius)
