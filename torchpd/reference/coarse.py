@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 PASSES = 1024  # states at which Phi is looked at
-ONE_POINT = 1e-6  # of a body's size and distance from the origin, which float32 rounds: how far pins at a point lie apart
+ONE_POINT = 1e-6  # of a body's size and distance from the origin, which float32 rounds: pins so near lie at a point
 ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
 STILL = 1e-7  # of the size of a body: a step that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
@@ -285,7 +285,7 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
     while True:
         hessian, force = _newton_terms(motions, contacts, radius)
         # a line has no inertia about itself
-        step = np.linalg.lstsq(hessian, force, rcond=1e-12)[0]
+        step: Array = np.asarray(np.linalg.lstsq(hessian, force, rcond=1e-12)[0], np.float64)
         length = motions.share(step)
         lag = contacts.friction * contacts.normal_forces() - radius
         lagging, size = float(np.linalg.norm(lag)), float(np.linalg.norm(radius))
@@ -305,9 +305,8 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
             left -= 1
             trial = motions.after(share * step)
             there = contacts_of(trial)
-            moves = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(
-                1
-            )
+            moved_by = (trial.displacement - motions.displacement)[contacts.vertices]
+            moves = (contacts.weights[:, :, None] * moved_by).sum(axis=1)
             # by the normals of before, so that both energies are of one function
             reached = trial.energy + replace(contacts.shifted(moves), gaps=there.gaps).energy(radius)
             second, down = _newton_terms(trial, there, radius)

@@ -64,11 +64,8 @@ struct VertexForces {
 
 template <class Lanes>
 CoarseVertex<typename Lanes::Wide> coarse_vertex(const Workspace<Lanes>& w, std::int64_t i) {
-  using Wide = typename Lanes::Wide;
-  const Wide none(0.0), inverse = Lanes::widen(w.inverse[i]);
-  const auto moves = inverse > none;
-  return {widened<Wide>(Lanes::vec3(w.x[i])), widened<Wide>(Lanes::vec3(w.u[i])),
-          select(moves, Wide(1.0) / select(moves, inverse, Wide(1.0)), none), inverse};
+  return {widened<typename Lanes::Wide>(Lanes::vec3(w.x[i])),
+          widened<typename Lanes::Wide>(Lanes::vec3(w.u[i])), Lanes::widen(w.inverse[i])};
 }
 
 template <class Lanes>

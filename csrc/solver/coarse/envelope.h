@@ -130,12 +130,17 @@ PD_HD void add_terms(W (&sum)[ContactSums::count], const ContactTerms<W>& of) {
   }
 }
 
-// A vertex of a body that moves, in double: its position at the start of the step, its displacement at the iterate, D and
-// 1 / D, both 0 where a pin holds it.
+// A vertex of a body that moves, in double: its position at the start of the step, its displacement at the iterate, 1 / D.
 template <class W>
 struct CoarseVertex {
   Vec3<W> x, u;
-  W stiffness, inverse;
+  W inverse;  // 0: a pin holds it
+
+  // D, or 0
+  PD_HD W stiffness() const {
+    const auto moves = inverse > W(0.0);
+    return select(moves, W(1.0) / select(moves, inverse, W(1.0)), W(0.0));
+  }
 };
 
 template <class W>
@@ -192,8 +197,8 @@ PD_HD void keep_forces(const Contacts<R>& contacts, const CoarseVertex<W>& v, co
   const W none(0.0);
   Vec3<W> at = free;
   each_contact<W>(contacts, [&](int n, const auto& shape) {
-    const Vec3<W> next = project(shape, v.x, at, v.u);
-    const Vec3<W> force = v.stiffness * (next - at);
+    const Vec3<W> next = project(shape, v.x, at, v.u), way = next - at;
+    const Vec3<W> force = (any(dot(way, way) > none) ? v.stiffness() : none) * way;
     const W normal = dot(force, surface_at(shape, v.x, v.u).normal);
     forces.set(n, force, select(normal > none, shape.friction * normal, none));
     at = next;
@@ -209,6 +214,13 @@ PD_HD W anchor_energy(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
   return W(0.5) * v.inverse * square;
 }
 
+// Whether the envelope of a contact is more than 0 anywhere: without a force at the iterate, where the gap is negative.
+template <class W>
+PD_HD bool touches(const W& gap, const Vec3<W>& force, const W& radius) {
+  const W none(0.0);
+  return any(gap < none) || any(radius + dot(force, force) > none);
+}
+
 // How far the contacts push a vertex once its body has moved, one after another: (f - f0) / D.
 template <class R, class W, class Forces>
 PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
@@ -217,9 +229,11 @@ PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
   each_contact_in_turn<W>(
       contacts, v.inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
         const Surface<W> at = before_pushes(surface_at(shape, v.x, v.u + push), later);
-        const Envelope<W> envelope(v.stiffness, forces.force(n), at.normal);
-        push =
-            push + v.inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
+        const Vec3<W> force = forces.force(n);
+        const W radius = forces.radius(n);
+        if (!touches(at.gap, force, radius)) return;
+        const Envelope<W> envelope(v.stiffness(), force, at.normal);
+        push = push + v.inverse * (envelope.force(at, radius) - envelope.anchor(at.normal));
       });
   return push;
 }
@@ -250,15 +264,16 @@ PD_HD void each_contact_term(const Contacts<R>& contacts, const CoarseVertex<W>&
                                   before.slip + tangential(then - first, before.normal)};
         const Vec3<W> force = forces.force(n);
         const W last_radius = forces.radius(n);
-        const Envelope<W> old(v.stiffness, force, before.normal),
-            now(v.stiffness, force, after.normal);
-        const W normal = now.normal_force(after.gap);
-        const W size = ((old.normal_force(before.gap) + normal) + last_radius) + dot(force, force);
-        add(any(size > none), [&] {
+        const W least = select(before.gap < after.gap, before.gap, after.gap);
+        add(touches(least, force, last_radius), [&] {
+          const W stiffness = v.stiffness();
+          const Envelope<W> old(stiffness, force, before.normal),
+              now(stiffness, force, after.normal);
+          const W normal = now.normal_force(after.gap);
           ContactTerms<W> terms;
           terms.before = v.inverse * old.energy(before, last_radius);
           terms.after = v.inverse * old.energy(there, last_radius);
-          const W free = select(v.stiffness > none, W(1.0), none);
+          const W free = select(v.inverse > none, W(1.0), none);
           const W radius =
               multiply_add(trial.renews, shape.friction * normal - last_radius, last_radius);
           forces.set_radius(n, radius);
@@ -268,8 +283,8 @@ PD_HD void each_contact_term(const Contacts<R>& contacts, const CoarseVertex<W>&
           terms.arm = arm + way;
           terms.normal = after.normal;
           terms.force = free * multiply_add(normal, after.normal, rub.share * rub.pull);
-          terms.across = rub.share * v.stiffness;
-          terms.along = select(normal > none, v.stiffness, none);
+          terms.across = rub.share * stiffness;
+          terms.along = select(normal > none, stiffness, none);
           return terms;
         });
       });
