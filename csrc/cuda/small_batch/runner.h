@@ -144,9 +144,9 @@ class SmallBatchRunner {
     return memory_.part_sum +
            std::int64_t(first_of_block_ + environment) * count_rows(plan_) * PartSums::count;
   }
-  PD_DEVICE Correction<T, HasContacts> correction(int environment, Iterate from) const {
+  PD_DEVICE Correction<T, HasContacts> correction(int environment, bool first) const {
     return {v_, contacts(environment), inputs(environment),
-            memory_.forces.of_environment(first_of_block_ + environment), from};
+            memory_.forces.of_environment(first_of_block_ + environment), first};
   }
 
   // ---- assignment of work
@@ -387,7 +387,7 @@ class SmallBatchRunner {
   }
 
   PD_DEVICE void correct_pieces(bool first);
-  PD_DEVICE void keep_forces(Iterate from);
+  PD_DEVICE void keep_forces();
   template <class Visit>
   PD_DEVICE void each_slot_of_a_piece(const Visit& visit);
 

@@ -40,7 +40,8 @@ void (*mixed_pass(Visit what))(MixedStreamCall<T>, int) {
     case Visit::update:
       return mixed_patches<Visit::update, T, HasContacts>;
     case Visit::keep_forces:
-      return mixed_patches<Visit::keep_forces, T, HasContacts>;
+      if constexpr (HasContacts) return mixed_patches<Visit::keep_forces, T, HasContacts>;
+      [[fallthrough]];
     default:
       return mixed_patches<Visit::update_guarded, T, HasContacts>;
   }
