@@ -200,7 +200,7 @@ def test_an_environment_does_not_know_of_the_others(name: str, outer: str, dtype
 
 
 def test_landings_that_a_tolerance_ends_have_the_same_bits_alone_and_in_a_batch() -> None:
-    case = landing(1e5)
+    case = landing(1e6)
     sim = simulator(case, torch.float32, GPU, solver=pd.Multilevel(), iterations=96, tolerance=1e-3)
     factor = torch.linspace(0.5, 1.5, 64, device=GPU)[:, None, None]
     state = state_of(case, sim, 64)
