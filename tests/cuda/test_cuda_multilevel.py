@@ -88,7 +88,8 @@ def share(gpu: pd.Simulator, cpu: pd.Simulator) -> None:
     if gpu.plan.level_sizes[6]:
         reference = (array.cpu() for array in stored_reference(gpu.plan.arrays))
         cpu.plan = precondition_plan(cpu.plan, cpu.scene.values(), *reference, most_direct=multilevel.MOST_DIRECT)
-        arrays = {"level_sizes": cpu.plan.level_sizes.numpy()}
+        arrays = {"level_sizes": cpu.plan.level_sizes.numpy().copy()}
+        arrays["level_sizes"][multilevel._PIECES] = gpu.plan.level_sizes[multilevel._PIECES]
         for name in ("piece_of", "piece_weight"):
             found = getattr(gpu.plan, name).cpu().numpy()
             arrays[name] = np.empty_like(found)
