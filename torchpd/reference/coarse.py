@@ -222,7 +222,8 @@ class Correction(NamedTuple):
 
     displacement: Array  # [V, 3] m
     forces: Array  # [m, 3] N of the pairs
-    moves: NDArray[np.bool_]  # [components]: whether pins leave a motion
+    energies: Array  # [components] J: Phi of its island, before the pushes; inf where pins leave no motion
+    pushes: Array  # [V, 3] m: after the motion, by the contacts and the projection
 
 
 def correct(
@@ -243,15 +244,16 @@ def correct(
         motions: makes the motions of an island.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
-    moves = np.zeros(int(problem.values.component.max()) + 1, np.bool_)
+    energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
     for bodies, of in islands(problem, pairs):
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, each = _correct_island(moving, forces, own)
+        corrected, push, each, energy = _correct_island(moving, forces, own)
+        pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
-        moves[problem.values.component[[body[0] for body in bodies]]] = True
-    return Correction(corrected, after, moves)
+        energies[problem.values.component[[body[0] for body in bodies]]] = energy
+    return Correction(corrected, after, energies, pushes)
 
 
 def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
@@ -267,8 +269,8 @@ def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[t
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array]:
-    """Displacement [V, 3] m and forces [m, 3] N of all contacts after the correction."""
+def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, Array, float]:
+    """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
 
     def contacts_of(motions: Motions) -> Envelopes:
@@ -276,7 +278,7 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
 
     contacts = contacts_of(motions)
     radius = contacts.friction * contacts.normal_anchors
-    moved, left = 0.0, PASSES - 1
+    phi, moved, left = motions.energy + contacts.energy(radius), 0.0, PASSES - 1
     while True:
         hessian, force = _newton_terms(motions, contacts, radius)
         # a line has no inertia about itself
@@ -314,8 +316,8 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
             share = nearer if 0.0 < nearer < share else 0.5 * share
         else:
             break
-        motions, contacts, moved = trial, there, moved + share * length
-    return _pushed(motions, contacts, radius), contacts.forces(radius)
+        motions, contacts, phi, moved = trial, there, reached, moved + share * length
+    return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
 def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
@@ -326,8 +328,8 @@ def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple
     return matrix, np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient
 
 
-def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
-    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection.
+def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection, and these changes.
 
     A vertex that touches several planes and spheres is pushed by one after another.
     """
@@ -345,7 +347,7 @@ def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> Array:
         pushed = pushed + np.where(problem.free[:, None], forces / problem.diagonal[:, None], 0.0)
     moved = motions.displacement.copy()
     moved[own] = problem.project(pushed)[own]
-    return moved
+    return moved, moved - motions.displacement
 
 
 def _cross(vectors: Array) -> Array:

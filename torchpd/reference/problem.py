@@ -25,8 +25,8 @@ class StepProblem(Objective):
     def first_iterate(self, start: str | Array = "velocity") -> Array:
         """u_0 [V, 3] m with pins at their targets and out of contacts.
 
-        `start` is "velocity" (h v), "inertial" (s) or positions [V, 3]. With a named start solids that move take their
-        present shape, after a coarse correction, and other bodies that guess (`reference.rigid`).
+        `start` is "velocity" (h v), "inertial" (s) or positions [V, 3]. With a named start every body takes that guess
+        or its present shape, after a coarse correction (`reference.rigid`).
         """
         if isinstance(start, str):
             guesses = {"velocity": self.time_step * self.velocities, "inertial": self.target}

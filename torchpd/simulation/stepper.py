@@ -85,8 +85,9 @@ class Stepper(Readable):
                 pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
                 `Fibres` take their activation during the step, a number [], [B], [n] or [B, n] for n fibres.
                 A `Pressure` takes its overpressure [] or [B] Pa, `Wind` its velocity [3] or [B, 3] m/s.
-            start: first iterate of cloth, rods and clamped solids: "velocity" (x + h v) or "inertial" (with gravity and
-                forces). Solids that move start in their present shape, moved as rigid bodies. Or positions [B, V, 3].
+            start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
+                The first two are moved along rigid motions and out of contacts. A body that planes would squeeze there
+                starts from x.
             return_info: also return a report of the solve; costs about ten iterations, no synchronisation.
 
         Returns:
@@ -197,7 +198,7 @@ class Stepper(Readable):
             first: number of the first step when this rollout continues another: `rollout(state, 9)` equals
                 `rollout(rollout(state, 5).state(), 4, first=5)`. A function of targets is then also called for step
                 first - 1.
-            start: first iterate of every step, "velocity" or "inertial", as in a call.
+            start: first iterate of every step, "velocity" or "inertial".
             return_info: fill in residual, energy and inverted of the recorded steps, see `Info`.
             progress: show a bar; a GPU then synchronises every 0.1 s or so.
 

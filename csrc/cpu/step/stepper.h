@@ -80,29 +80,20 @@ class Stepper {
     team_.barrier();
   }
 
-  // The coarse correction: every body that pins leave free takes the rigid motion with the least energy. The first iterate
-  // of a solid one is its present shape, so moved, not the guess.
+  // The coarse correction: every body that pins leave free takes the rigid motion with the least energy. Before the
+  // iterations a solid one chooses between two iterates: the present shape, and the guess.
   void align() {
     const bool first = !started_;
     started_ = true;
     if (plan_.components == 0 || (first && set_.start() == StartKind::given)) return;
-    if (first) {
-      each_that_moves([&](std::int64_t i) {
-        if (plan_.vertex_component[i] < plan_.solid_components)
-          w_.u[i] = vertex(i).current_iterate(contacts_);
-      });
-      team_.barrier();
-    }
+    if (first && plan_.solid_components > 0) return choose_first_iterate();
     if constexpr (HasContacts) {
-      each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force); });
+      each_elastic_force(
+          [&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force, Wide(1.0)); });
     }
     correct();
     if (first) {
-      each_that_moves([&](std::int64_t i) {
-        const Wide moves = w_.body_sums[plan_.vertex_component[i]].moves;
-        w_.u[i] = w_.before[i] =
-            select(Lanes::narrow(moves) > Real(T(0)), w_.u[i], guessed_iterate(i));
-      });
+      each_that_moves([&](std::int64_t i) { w_.before[i] = w_.u[i]; });
       team_.barrier();
     }
   }
@@ -169,11 +160,12 @@ class Stepper {
 
   VertexForces<Lanes> forces_of(std::int64_t i) const { return {w_, plan_.vertices, int(i)}; }
 
-  // Keeps the forces with which the contacts answer the gradient of E.
-  void keep_forces(std::int64_t i, const Vec3<Wide>& elastic) {
+  // Keeps the forces with which the contacts answer the gradient of E; `inertial`: 1, or 0 without inertia.
+  void keep_forces(std::int64_t i, const Vec3<Wide>& elastic, const Wide& inertial) {
     const CoarseVertex<Wide> v = coarse_vertex(w_, i);
     const Vec3<Wide> offset = v.u - widened<Wide>(Lanes::vec3(w_.target[i]));
-    const Vec3<Wide> gradient = multiply_add(Lanes::widen(w_.inertia[i]), offset, elastic);
+    const Vec3<Wide> gradient =
+        multiply_add(inertial * Lanes::widen(w_.inertia[i]), offset, elastic);
     const Vec3<Wide> free = subtract_product(v.u, Lanes::widen(w_.inverse[i]), gradient);
     pd::keep_forces(contacts_, v, free, forces_of(i));
   }
@@ -200,8 +192,77 @@ class Stepper {
     team_.barrier();
   }
 
+  Value present_iterate(std::int64_t i) const { return vertex(i).current_iterate(contacts_); }
   Value guessed_iterate(std::int64_t i) const {
     return vertex(i).first_iterate(contacts_, guess(i));
+  }
+
+  // The present shape and the guess are both corrected, and the one with the lower energy stays (rise_of). For the present
+  // shape, contacts answer the elastic forces alone.
+  void choose_first_iterate() {
+    const auto add_work = [&](std::int64_t i, const Vec3<Wide>& force, double side) {
+      const Vec3<Wide> way = widened<Wide>(Lanes::vec3(guessed_iterate(i))) -
+                             widened<Wide>(Lanes::vec3(present_iterate(i)));
+      Wide work = Wide(0.5) * dot(force, way);
+      if constexpr (HasContacts) {
+        keep_forces(i, force, Wide(side > 0 ? 0.0 : 1.0));
+        work = multiply_add(Wide(side),
+                            anchor_energy(contacts_, coarse_vertex(w_, i), forces_of(i)), work);
+      }
+      w_.work[i] = w_.work[i] + Lanes::narrow(work);
+    };
+    each_that_moves([&](std::int64_t i) {
+      w_.u[i] = present_iterate(i);
+      w_.work[i] = Real(T(0));
+    });
+    team_.barrier();
+    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, 1.0); });
+    correct();
+    if (team_.rank == 0) {
+      for (int n = 0; n < plan_.components * width; ++n) w_.reached[n] = w_.bodies[n].reached();
+      for (int g = 0; g < plan_.components; ++g) w_.motion_before[g] = w_.motion[g];
+    }
+    each_that_moves([&](std::int64_t i) {
+      w_.before[i] = w_.u[i];
+      w_.u[i] = guessed_iterate(i);
+    });
+    team_.barrier();
+    each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, -1.0); });
+    correct();
+    if (team_.rank == 0) sum_rises();
+    team_.barrier();
+    each_that_moves([&](std::int64_t i) {
+      const int g = plan_.vertex_component[i];
+      const BodySums<Wide>& body = w_.body_sums[g];
+      const Real none(T(0)),
+          moves = Real(T(g < plan_.solid_components ? 1 : 0)) * Lanes::narrow(body.moves);
+      const auto stays = moves > none && !(Lanes::narrow(body.rise) < none);
+      w_.u[i] = w_.before[i] = select(stays, w_.before[i], w_.u[i]);
+    });
+    team_.barrier();
+  }
+
+  // Of every body, from the present shape to the guess.
+  void sum_rises() {
+    for (int g = 0; g < plan_.components; ++g) {
+      for (int lane = 0; lane < width; ++lane) {
+        const int n = g * width + lane;
+        put_lane<Lanes>(w_.body_sums[g].rise, lane, w_.bodies[n].reached() - w_.reached[n]);
+      }
+    }
+    each_in_a_body<Lanes>(plan_, [&](int i, int g) {
+      const auto candidate = [&](const Value& first, const Value& last,
+                                 const RigidMotion<Wide>& motion) {
+        return Candidate<Wide>{widened<Wide>(Lanes::vec3(first)), widened<Wide>(Lanes::vec3(last)),
+                               motion};
+      };
+      const Candidate<Wide> kept = candidate(present_iterate(i), w_.before[i], w_.motion_before[g]),
+                            moved = candidate(guessed_iterate(i), w_.u[i], w_.motion[g]);
+      Wide& rise = w_.body_sums[g].rise;
+      rise = (rise + Lanes::widen(w_.work[i])) +
+             rise_of<HasContacts>(Lanes::widen(w_.inertia[i]), widened<Wide>(Lanes::vec3(w_.x[i])),
+                                  widened<Wide>(Lanes::vec3(w_.target[i])), kept, moved);
+    });
   }
 
   Value target(std::int64_t i, const Real& spring, const Value& pin) const {

@@ -28,6 +28,7 @@ struct BodySums {
   Wide rigid[RigidSums::count], contact[ContactSums::count];
   Vec3<Wide> center;
   Wide moves;    // 1, or 0 where pins clamp it
+  Wide rise;     // of the energy, from the first to the second first iterate
   bool goes_on;  // in some environment
 };
 
@@ -50,11 +51,14 @@ struct Workspace {
   Real *inertia, *inverse;                            // [vertices] a, 1 / D (0: does not move)
   Value *origin, *shared_force;                       // [slots]
   Part* parts[2];  // iterations alternate, so that no thread overwrites sums that others read
-  BodySums<Wide>* body_sums;  // [components]
-  CoarseBody* bodies;         // [components, environments]
-  CoarseTrial<Wide>* trial;   // [components]
-  RigidMotion<Wide>* motion;  // [components]
-  Value* contact_force;       // [contacts, vertices], like the next
+  BodySums<Wide>* body_sums;         // [components]
+  CoarseBody* bodies;                // [components, environments]
+  CoarseTrial<Wide>* trial;          // [components]
+  RigidMotion<Wide>* motion;         // [components]
+  RigidMotion<Wide>* motion_before;  // [components] of the first of both first iterates
+  double* reached;       // [components, environments] Phi of the first of both first iterates
+  Real* work;            // [vertices] of the mean elastic force, from the first to the second
+  Value* contact_force;  // [contacts, vertices], like the next
   Real* friction_radius;
   Plane<Real>* planes;
   Sphere<Real>* spheres;
@@ -129,6 +133,9 @@ struct Workspace {
     place(body_sums, plan.components, base);
     place(bodies, plan.components * Lanes::environments, base);
     place(motion, plan.components, base);
+    place(motion_before, plan.components, base);
+    place(reached, plan.components * Lanes::environments, base);
+    place(work, plan.components > 0 ? plan.vertices : 0, base);
     const std::int64_t contacts =
         plan.components > 0 ? material.planes_count + material.spheres_count : 0;
     place(trial, contacts > 0 ? plan.components : 0, base);

@@ -21,6 +21,9 @@ class FusedRounds {
     find_motions<HasContacts>(plan, *this);
     each_slot(
         [&](int s, int vertex, const Piece& piece) { return of.corrected(s, vertex, piece.body); });
+    if (!has_choice(plan, of.from)) return;
+    find<Round::rises>();
+    each_slot([&](int s, int, const Piece& piece) { return of.chosen(s, piece.body, piece.rise); });
   }
 
   template <Round What>
@@ -44,7 +47,7 @@ class FusedRounds {
     for (int n = warp; n < plan.pieces; n += warps) sum_piece<What>(plan, n, part_sums, pieces[n]);
     __syncthreads();
     for (int n = threadIdx.x; n < plan.pieces; n += blockDim.x)
-      move_piece<What>(of.contacts.exist(), pieces[n]);
+      move_piece<What>(plan, n, of.from, of.contacts.exist(), pieces[n]);
     __syncthreads();
   }
 
@@ -110,22 +113,27 @@ template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InSha
           bool HasStencils>
 PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared,
                            HasStencils>::correct_pieces(bool first) {
-  if (first) take_present_shape();
-  // a kernel for contacts may serve a scene without
-  if (contacts_.exist()) keep_forces();
-  sums_ = run_rounds<T, HasContacts, Kind>({plan_, correction(first), origin_,
-                                            Clustered ? nullptr : position_, &piece(0), part_sums(),
-                                            index_, sums_});
-  moved_ = true;
+  const bool both = first && plan_.solid_pieces > 0;
+  if (both) take_present_shape();
+#pragma unroll 1
+  for (int n = both ? 0 : 1; n < 2; ++n) {
+    const Iterate from = iterate_of(n, first);
+    // a kernel for contacts may serve a scene without
+    if (first || contacts_.exist()) keep_forces(from);
+    sums_ = run_rounds<T, HasContacts, Kind>({plan_, correction(from), origin_,
+                                              Clustered ? nullptr : position_, &piece(0),
+                                              part_sums(), index_, sums_});
+    moved_ = true;
+  }
 }
 
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
           bool HasStencils>
 PD_DEVICE void
 FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::take_present_shape() {
+  const Correction<T, HasContacts> present = correction(Iterate::present);
   each_slot([&](int s) {
-    const int number = plan_.slot_piece[patch_.first_slot + s];
-    if (0 <= number && number < plan_.solid_pieces) move(s, v_.at(s).current_iterate(contacts_));
+    if (plan_.slot_piece[patch_.first_slot + s] >= 0) move(s, present.present(s));
   });
   moved_ = true;
   __syncthreads();
@@ -134,9 +142,9 @@ FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::take_pr
 // The owner of a vertex keeps its forces.
 template <class T, bool HasContacts, bool HasFreePieces, Blocks Kind, bool InShared,
           bool HasStencils>
-PD_DEVICE void
-FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::keep_forces() {
-  const Correction<T, HasContacts> keeper = correction(false);
+PD_DEVICE void FusedRunner<T, HasContacts, HasFreePieces, Kind, InShared, HasStencils>::keep_forces(
+    Iterate from) {
+  const Correction<T, HasContacts> keeper = correction(from);
   pass<false>(
       SolidGradient<false>{}, [] {}, false,
       [&](const WorkItem& at, const LoadedVertex&, const Vec3<T>& force) {

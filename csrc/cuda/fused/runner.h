@@ -474,11 +474,11 @@ class FusedRunner {
     loaded_ = {};
     guarding_ = late_ = false;
   }
-  PD_DEVICE Correction<T, HasContacts> correction(bool first) const {
-    return {v_, contacts_, in_, memory_.forces.of_environment(team_), first};
+  PD_DEVICE Correction<T, HasContacts> correction(Iterate from) const {
+    return {v_, contacts_, in_, memory_.forces.of_environment(team_), from};
   }
   PD_DEVICE void take_present_shape();
-  PD_DEVICE void keep_forces();
+  PD_DEVICE void keep_forces(Iterate from);
 
   // ---- results
 

@@ -7,17 +7,21 @@
 namespace pd::inline PD_TARGET {
 
 // mean: of the positions. moments: about the mean; they begin the search for a motion, and without
-// contacts end it. contacts: one pass of every piece that still searches.
-enum class Round { mean, moments, contacts };
+// contacts end it. contacts: one pass of every piece that still searches. rises: energy of the
+// corrected guess relative to the corrected present shape.
+enum class Round { mean, moments, contacts, rises };
 
-// Values of a part: RigidSums, or ContactSums.
+// Values of a part: RigidSums, ContactSums, or a rise.
 struct PartSums {
   static constexpr int count = RigidSums::count;
   static_assert(ContactSums::count <= count);
 };
 
 struct Piece {
-  double sum[RigidSums::count], contact[ContactSums::count];  // over all its parts
+  double sum[RigidSums::count], contact[ContactSums::count], rise;  // over all its parts
+  // of the correction before
+  double reached;
+  RigidMotion<double> motion_before;
   CoarseBody body;
 };
 
@@ -25,6 +29,12 @@ struct Piece {
 template <class T>
 PD_DEVICE bool has_whole_parts(const DevicePlan<T>& plan) {
   return plan.parts == plan.pieces;
+}
+
+// Whether the corrected guess follows the corrected present shape, and the one of less energy is kept.
+template <class T>
+PD_DEVICE bool has_choice(const DevicePlan<T>& plan, Iterate from) {
+  return from == Iterate::guess && plan.solid_pieces > 0;
 }
 
 // Rows of sums: of parts, and of sums of rows.
@@ -100,9 +110,10 @@ struct RowNumbers {
   template <class T>
   PD_DEVICE RowNumbers(Round what, const DevicePlan<T>& plan)
       : begin(what == Round::moments && !has_whole_parts(plan) ? RigidSums::target_offset : 0),
-        end(what == Round::mean      ? RigidSums::target_offset
-            : what == Round::moments ? RigidSums::count
-                                     : ContactSums::count) {}
+        end(what == Round::mean       ? RigidSums::target_offset
+            : what == Round::moments  ? RigidSums::count
+            : what == Round::contacts ? ContactSums::count
+                                      : 1) {}
   PD_DEVICE bool has(int n) const { return begin <= n && n < end; }
 };
 
@@ -232,8 +243,14 @@ PD_DEVICE_COLD void sum_part(const Correction<T, HasContacts>& of, const DeviceP
     write_shares(sum, to + S::target_offset);
     if (plan.pins > 0) part.each([&](int i, int) { add_pin(held, double(v.inertia(i)), at(i)); });
     write_shares(held, to + S::pins);
-  } else if (!piece.body.is_done()) {
-    sum_contacts(of, part, piece.body, to);
+  } else if constexpr (What == Round::contacts) {
+    if (!piece.body.is_done()) sum_contacts(of, part, piece.body, to);
+  } else {
+    double sum[1] = {};
+    part.each([&](int i, int vertex) {
+      sum[0] += of.rise_of(i, vertex, piece.motion_before, piece.body.motion());
+    });
+    write_shares(sum, to);
   }
 }
 
@@ -244,19 +261,28 @@ PD_DEVICE void sum_piece(const DevicePlan<T>& plan, int piece, const double* row
   const RowNumbers numbers(What, plan);
   const int* of = plan.piece_rows + 2 * piece;
   const double own = sum_over_rows(numbers, row, of[0], of[1]);
-  double* const total = What == Round::contacts ? to.contact : to.sum;
+  double* const total = What == Round::contacts ? to.contact
+                        : What == Round::rises  ? &to.rise
+                                                : to.sum;
   if (numbers.has(lane)) total[lane] = own;
 }
 
 // What follows from them, by a thread.
-template <Round What>
-PD_DEVICE_COLD void move_piece(bool has_contacts, Piece& of) {
+template <Round What, class T>
+PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Iterate from,
+                               bool has_contacts, Piece& of) {
   if constexpr (What == Round::moments) {
+    if (has_choice(plan, from)) {
+      of.reached = of.body.reached();
+      of.motion_before = of.body.motion();
+    }
     of.body = CoarseBody(RigidBody(of.sum));
     for (double& sum : of.contact) sum = 0;
     while (!has_contacts && !of.body.is_done()) of.body.pass(of.contact);
   } else if constexpr (What == Round::contacts) {
     if (!of.body.is_done()) of.body.pass(of.contact);
+  } else if constexpr (What == Round::rises) {
+    of.rise = piece < plan.solid_pieces ? of.rise + (of.body.reached() - of.reached) : -1;
   }
 }
 

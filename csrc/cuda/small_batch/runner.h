@@ -144,9 +144,9 @@ class SmallBatchRunner {
     return memory_.part_sum +
            std::int64_t(first_of_block_ + environment) * count_rows(plan_) * PartSums::count;
   }
-  PD_DEVICE Correction<T, HasContacts> correction(int environment, bool first) const {
+  PD_DEVICE Correction<T, HasContacts> correction(int environment, Iterate from) const {
     return {v_, contacts(environment), inputs(environment),
-            memory_.forces.of_environment(first_of_block_ + environment), first};
+            memory_.forces.of_environment(first_of_block_ + environment), from};
   }
 
   // ---- assignment of work
@@ -387,7 +387,7 @@ class SmallBatchRunner {
   }
 
   PD_DEVICE void correct_pieces(bool first);
-  PD_DEVICE void keep_forces();
+  PD_DEVICE void keep_forces(Iterate from);
   template <class Visit>
   PD_DEVICE void each_slot_of_a_piece(const Visit& visit);
 

@@ -116,8 +116,8 @@ struct StreamWork {
   PD_DEVICE double* part_sums() const {
     return call.memory.part_sum + environment * count_rows(plan) * PartSums::count;
   }
-  PD_DEVICE Correction<T, HasContacts> correction(bool first) const {
-    return {v, contacts, in, call.memory.forces.of_environment(environment), first};
+  PD_DEVICE Correction<T, HasContacts> correction(Iterate from) const {
+    return {v, contacts, in, call.memory.forces.of_environment(environment), from};
   }
 };
 
@@ -157,12 +157,13 @@ PD_DEVICE double omega_of_pass(const StreamWork<T, HasContacts>& w, int k) {
 template <Visit What, class T, bool HasContacts>
 PD_DEVICE void visit(const StreamWork<T, HasContacts>& w, unsigned i,
                      const typename Vertices<T, HasContacts>::LoadedVertex& loaded,
-                     const Vec3<T>& force, T omega, ThreadSums& sums) {
+                     const Vec3<T>& force, T omega, ThreadSums& sums,
+                     Iterate from = Iterate::last) {
   double (&sum)[sums_count] = sums.value;
   if constexpr (What == Visit::diagonal) {
     sum[0] = Min{}(sum[0], w.v.set_diagonal(i, force.x));
   } else if constexpr (What == Visit::keep_forces) {
-    w.correction(false).keep_forces(int(i), int(i), force);
+    w.correction(from).keep_forces(int(i), int(i), force);
   } else {
     if constexpr (What == Visit::update_guarded) sum[0] += loaded.energy();
     if (!alternates(w.settings())) sum[2] += loaded.square_of_displacement();
@@ -291,7 +292,8 @@ PD_DEVICE double pass_over_patch(const StreamWork<T, HasContacts>& w, int number
   return energy;
 }
 
-// Updates the elements and interior vertices of one patch per block. `k`: iteration.
+// Updates the elements and interior vertices of one patch per block. `k`: iteration, or Iterate for
+// keep_forces.
 template <Visit What, class T, bool HasContacts, class Stencils>
 PD_DEVICE void update_patch(const StreamCall<T>& call, int k, std::byte* shared,
                             const Stencils& stencils) {
@@ -315,7 +317,7 @@ PD_DEVICE void update_patch(const StreamCall<T>& call, int k, std::byte* shared,
       w, number, shared, typename ElementOf<What>::type{}, stencils,
       [&](int i) { return load_vertex<What>(w, i); },
       [&](int i, const auto& loaded, const Vec3<T>& force) {
-        visit<What>(w, i, loaded, force, T(omega), sums);
+        visit<What>(w, i, loaded, force, T(omega), sums, Iterate(k));
       });
   if constexpr (What != Visit::diagonal) sums.value[0] += energy;
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(number));

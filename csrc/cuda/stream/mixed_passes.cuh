@@ -40,8 +40,7 @@ void (*mixed_pass(Visit what))(MixedStreamCall<T>, int) {
     case Visit::update:
       return mixed_patches<Visit::update, T, HasContacts>;
     case Visit::keep_forces:
-      if constexpr (HasContacts) return mixed_patches<Visit::keep_forces, T, HasContacts>;
-      [[fallthrough]];
+      return mixed_patches<Visit::keep_forces, T, HasContacts>;
     default:
       return mixed_patches<Visit::update_guarded, T, HasContacts>;
   }

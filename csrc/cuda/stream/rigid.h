@@ -11,7 +11,7 @@ constexpr int rounds_threads = 128;
 template <class T>
 struct RoundsCall {
   StreamCall<T> stream;
-  bool first;         // iterate of the step
+  Iterate from;
   int teams, blocks;  // blocks of a team
   unsigned* counter;  // [teams], zero at the launch
 };
@@ -21,12 +21,17 @@ struct RoundsCall {
 template <class T, bool HasContacts>
 class StreamRounds {
  public:
-  PD_DEVICE StreamRounds(const StreamWork<T, HasContacts>& w, bool first, BlockTeam& team)
-      : w_(w), of_(w.correction(first)), team_(team) {}
+  PD_DEVICE StreamRounds(const StreamWork<T, HasContacts>& w, Iterate from, BlockTeam& team)
+      : w_(w), of_(w.correction(from)), team_(team) {}
 
   PD_DEVICE void run() {
     find_motions<HasContacts>(w_.plan, *this);
     each_vertex([&](int i, const Piece& piece) { w_.v.set(i, of_.corrected(i, i, piece.body)); });
+    if (has_choice(w_.plan, of_.from)) {
+      find<Round::rises>();
+      each_vertex(
+          [&](int i, const Piece& piece) { w_.v.set(i, of_.chosen(i, piece.body, piece.rise)); });
+    }
     team_.barrier();  // blocks start an environment together
   }
 
@@ -46,7 +51,8 @@ class StreamRounds {
     for (int n = team_.warp(); n < w_.plan.pieces; n += team_.warps()) {
       sum_piece<What>(w_.plan, n, w_.part_sums(), w_.piece(n));
       __syncwarp();
-      if (threadIdx.x % warp_size == 0) move_piece<What>(HasContacts, w_.piece(n));
+      if (threadIdx.x % warp_size == 0)
+        move_piece<What>(w_.plan, n, of_.from, HasContacts, w_.piece(n));
     }
     team_.barrier();
   }
@@ -85,20 +91,21 @@ __global__ void __launch_bounds__(rounds_threads)
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.counter + number);
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
     const StreamWork<T, HasContacts> w(call.stream, e);
-    StreamRounds<T, HasContacts>(w, call.first, team).run();
+    StreamRounds<T, HasContacts>(w, call.from, team).run();
   }
 }
 
-// Moves the vertices of solid pieces to the present shape, one warp per part.
+// Moves the vertices of pieces to the present shape, one warp per part.
 template <class T, bool HasContacts>
 __global__ void __launch_bounds__(rounds_threads)
     stream_present(const __grid_constant__ StreamCall<T> call) {
   const std::int64_t number = thread_number() / warp_size, parts = call.step.plan.parts;
   if (number >= call.step.batch * parts) return;
   const StreamWork<T, HasContacts> w(call, number / parts);
-  const Part part(w.plan, int(number % parts), true, 0);
-  if (part.piece(w.plan) < w.plan.solid_pieces)
-    part.each([&](int i, int) { w.v.set(i, w.v.at(i).current_iterate(w.contacts)); });
+  const auto present = w.correction(Iterate::present);
+  Part(w.plan, int(number % parts), true, 0).each([&](int i, int) {
+    w.v.set(i, present.present(i));
+  });
 }
 
 }  // namespace pd::inline PD_TARGET

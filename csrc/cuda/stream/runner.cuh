@@ -139,15 +139,14 @@ class StreamRunner {
     const bool first = !started_;
     started_ = true;
     if (plan_.pieces == 0 || (first && set_.start() == StartKind::given)) return;
-    if (first && plan_.solid_pieces > 0) {
-      constexpr int per_block = rounds_threads / warp_size;
-      const std::int64_t parts = call_.step.batch * plan_.parts;
-      launcher_.run(stream_present<T, HasContacts>, (parts + per_block - 1) / per_block,
-                    rounds_threads, 0, call_);
-    }
-    if constexpr (HasContacts) pass<Visit::keep_forces>(0);
-    RoundsCall<T> call = {call_, first, teams_.count, teams_.blocks, call_.memory.counter};
-    launch_teams(rounds_kernel(), call, call.counter, rounds_threads, 0, stream_);
+    if (!first) return correct(Iterate::last);
+    if (plan_.solid_pieces == 0) return correct(Iterate::guess);
+    constexpr int per_block = rounds_threads / warp_size;
+    const std::int64_t parts = call_.step.batch * plan_.parts;
+    launcher_.run(stream_present<T, HasContacts>, (parts + per_block - 1) / per_block,
+                  rounds_threads, 0, call_);
+    correct(Iterate::present);
+    correct(Iterate::guess);
   }
 
   void iterate(int k) {
@@ -236,6 +235,12 @@ class StreamRunner {
     return false;
   }
 
+  void correct(Iterate from) {
+    if (HasContacts || from != Iterate::last) pass<Visit::keep_forces>(int(from));
+    RoundsCall<T> call = {call_, from, teams_.count, teams_.blocks, call_.memory.counter};
+    launch_teams(rounds_kernel(), call, call.counter, rounds_threads, 0, stream_);
+  }
+
   template <Decision What>
   void decide(int k) {
     // one thread per row of sums
@@ -296,7 +301,7 @@ void allow_shared_memory(std::size_t bytes) {
   allow(stream_patches<Visit::diagonal, T, HasContacts>);
   allow(stream_patches<Visit::update, T, HasContacts>);
   allow(stream_patches<Visit::update_guarded, T, HasContacts>);
-  if constexpr (HasContacts) allow(stream_patches<Visit::keep_forces, T, HasContacts>);
+  allow(stream_patches<Visit::keep_forces, T, HasContacts>);
 }
 
 template <class T, bool HasContacts>

@@ -127,7 +127,7 @@ __global__ void __launch_bounds__(shared_threads,
   const double omega = omega_of_pass<What>(w, k);
   const Vec3<T> force = wait_for_force(w, places, round);
   ThreadSums sums = no_sums<What>();
-  if (i < w.plan.shared) visit<What>(w, vertex, loaded, force, T(omega), sums);
+  if (i < w.plan.shared) visit<What>(w, vertex, loaded, force, T(omega), sums, Iterate(k));
   if (wants_sums<What>(w)) write_sums<What>(sums, w.sum_row(w.plan.patches + number));
 }
 

@@ -205,6 +205,15 @@ PD_HD void keep_forces(const Contacts<R>& contacts, const CoarseVertex<W>& v, co
   });
 }
 
+// Of these forces: sum |f0|^2 / (2 D), which Phi has more than the energy.
+template <class R, class W, class Forces>
+PD_HD W anchor_energy(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
+  W square(0.0);
+  for (int n = 0; n < contacts.plane_count + contacts.sphere_count; ++n)
+    square = square + dot(forces.force(n), forces.force(n));
+  return W(0.5) * v.inverse * square;
+}
+
 // Whether the envelope of a contact is more than 0 anywhere: without a force at the iterate, where the gap is negative.
 template <class W>
 PD_HD bool touches(const W& gap, const Vec3<W>& force, const W& radius) {

@@ -61,6 +61,8 @@ class CoarseBody {
   PD_HD bool moves() const { return body_.weight > 0 && body_.hold != Hold::all; }
   PD_HD bool is_done() const { return done_; }
   PD_HD const RigidMotion<double>& motion() const { return accepted_; }
+  // Phi before the last step, the quadratics relative to no motion
+  PD_HD double reached() const { return reached_; }
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
@@ -78,6 +80,7 @@ class CoarseBody {
     find_terms(sum, terms);
     if (share_ > 0 && !ends_step(terms, after <= before + rounding)) return try_step();
     accepted_ = trial_;
+    reached_ = after;
     moved_ += share_ * length_of(step_);
     decide(terms, sum[S::lag], sum[S::radius]);
   }
@@ -249,9 +252,36 @@ class CoarseBody {
   double size_, length_;  // length_: 1 / size_
   // share_: of the step, tried. slope_: of Phi down the step, at its start. moved_: since radii moved. renews_: share by
   // which the pass moves radii toward friction l.
-  double step_[6] = {}, share_ = 0, slope_ = 0, moved_ = 0, renews_ = 0;
+  double step_[6] = {}, share_ = 0, slope_ = 0, moved_ = 0, reached_ = 0, renews_ = 0;
   int passes_ = 0;
   bool done_ = true;
 };
+
+// One of the two first iterates of a step, at a vertex: its displacement before and after the correction, and the motion of
+// its body.
+template <class W>
+struct Candidate {
+  Vec3<W> first, last;
+  RigidMotion<W> motion;
+};
+
+// What a vertex adds to the rise of energy from the corrected present shape, `kept`, to the corrected guess, `moved`; besides
+// the rise of Phi, and the work of the mean elastic force and the anchors' energies, which are known before. Inertia before
+// the corrections, which Phi lacks; and the work of the pushes on the inertia that the anchors do not answer: all of it where
+// they are those of elastic forces alone, else what the correction has changed.
+template <bool HasContacts, class W>
+PD_HD W rise_of(const W& inertia, const Vec3<W>& x, const Vec3<W>& target, const Candidate<W>& kept,
+                const Candidate<W>& moved) {
+  const Vec3<W> before = kept.first - target, after = moved.first - target;
+  W rise = W(0.5) * (dot(after, after) - dot(before, before));
+  if constexpr (HasContacts) {
+    const auto work = [&](const Candidate<W>& of, const Vec3<W>& answered) {
+      const Vec3<W> u = of.first + of.motion.of(x + of.first);
+      return dot(u - answered, of.last - u);
+    };
+    rise = rise + (work(moved, moved.first) - work(kept, target));
+  }
+  return inertia * rise;
+}
 
 }  // namespace pd::inline PD_TARGET
