@@ -1,6 +1,7 @@
 // The ops: schemas, and their CPU implementation.
 #include "binding/rollout_adjoint.h"
 
+#include "binding/contact_ops.h"
 #include "binding/history_ops.h"
 #include "binding/plan_views.h"
 #include "cpu/dispatch.h"
@@ -44,6 +45,12 @@ struct Cpu {
   }
   static void step(const StepCall<double>& call, const Tensor&) {
     kernels().step64(call, threads());
+  }
+  static void contact_step(const StepCall<float>& call, const ContactCall<float>& contact) {
+    kernels().contact_step32(call, contact, threads());
+  }
+  static void contact_step(const StepCall<double>& call, const ContactCall<double>& contact) {
+    kernels().contact_step64(call, contact, threads());
   }
   static void field(const FieldCall<float>& call, const Tensor&) {
     kernels().field32(call, threads());
@@ -131,6 +138,11 @@ TORCH_LIBRARY(torchpd, m) {
       "step_(Tensor(a!) positions, Tensor(b!) velocities, Tensor(c!) info, Tensor? forces, Tensor? "
       "start, Tensor[] material, Tensor[] plan, *, " +
       settings_schema() + ") -> ()");
+  with_plan(
+      "contact_step(Tensor positions, Tensor velocities, Tensor? forces, Tensor poses, Tensor[] "
+      "history, Tensor[] material, Tensor[] plan, Tensor[] contact, *, " +
+      settings_schema() +
+      ") -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   with_plan(
       "rollout(Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, Tensor[] "
       "plan, *, SymInt steps, SymInt every, " +
@@ -220,6 +232,7 @@ TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
   register_ops<Cpu>(m);
   register_adjoint_ops<Cpu>(m);
   register_history_ops<Cpu>(m);
+  register_contact_ops<Cpu>(m);
 }
 
 }  // namespace pd

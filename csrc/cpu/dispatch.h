@@ -1,5 +1,6 @@
 // Which compiled instruction set this machine runs.
 #pragma once
+#include "cpu/contact/views.h"
 #include "views/views.h"
 
 #include <string>
@@ -12,6 +13,8 @@ struct Kernels {
   const char* name;
   void (*step32)(const StepCall<float>&, int threads);
   void (*step64)(const StepCall<double>&, int threads);
+  void (*contact_step32)(const StepCall<float>&, const ContactCall<float>&, int threads);
+  void (*contact_step64)(const StepCall<double>&, const ContactCall<double>&, int threads);
   void (*field32)(const FieldCall<float>&, int threads);
   void (*field64)(const FieldCall<double>&, int threads);
   void (*report32)(const ReportCall<float>&, int threads);

@@ -3,6 +3,7 @@
 #include "cpu/adjoint/conjugate_gradients.h"
 #include "cpu/adjoint/energy_fields.h"
 #include "cpu/adjoint/system.h"
+#include "cpu/contact/stepper.h"
 #include "cpu/multilevel/stepper.h"
 #include "cpu/step/report.h"
 #include "cpu/step/stepper.h"
@@ -106,6 +107,30 @@ template <class T>
 void step_any(const StepCall<T>& call, int threads) {
   const bool has_contacts = call.material.planes_count + call.material.spheres_count > 0;
   has_contacts ? step_with<true>(call, threads) : step_with<false>(call, threads);
+}
+
+// Environment by environment, each by one thread.
+template <bool HasContacts, class T>
+void contact_step_with(const StepCall<T>& call, const ContactCall<T>& contact, int threads) {
+  using Lanes = Single<T>;
+  std::atomic<std::int64_t> next{0};
+  run_team(int(std::min<std::int64_t>(threads, call.batch)), [&](const Team& team) {
+    const CleanRegisters clean;
+    Workspace<Lanes> work(call);
+    Scratch<Lanes> scratch(call.plan.most_slots);
+    ContactRun<T> run(contact.plan);
+    Approach<T> approach(contact.plan);
+    const Team alone = team.alone();
+    for (std::int64_t e = next++; e < call.batch && !alone.ended(0); e = next++)
+      ContactStepper<T, HasContacts>(call, work, scratch, alone, e, contact, run, approach).rollout();
+  });
+}
+
+template <class T>
+void contact_step_any(const StepCall<T>& call, const ContactCall<T>& contact, int threads) {
+  const bool has_contacts = call.material.planes_count + call.material.spheres_count > 0;
+  has_contacts ? contact_step_with<true>(call, contact, threads)
+               : contact_step_with<false>(call, contact, threads);
 }
 
 template <class T>
@@ -240,6 +265,8 @@ extern const Kernels PD_KERNELS;
 const Kernels PD_KERNELS = {PD_NAME,
                             &step_any<float>,
                             &step_any<double>,
+                            &contact_step_any<float>,
+                            &contact_step_any<double>,
                             &field_any<float>,
                             &field_any<double>,
                             &report_any<float>,

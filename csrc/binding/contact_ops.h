@@ -1,0 +1,165 @@
+// The op of a step with contact between bodies.
+#pragma once
+#include "binding/ops.h"
+#include "cpu/contact/views.h"
+
+#include <cstdint>
+#include <tuple>
+#include <vector>
+
+namespace pd {
+
+// Positions, velocities, info; then numbers of the contact, how far colliders were held back, and the history.
+using ContactOutputs =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+// The arrays of a contact plan, in their order.
+enum ContactArray : int {
+  contact_sizes,
+  contact_triangle,
+  contact_edge,
+  contact_point,
+  contact_body,
+  contact_collider,
+  contact_touches_itself,
+  contact_point_order,
+  contact_triangle_order,
+  contact_edge_order,
+  contact_rest_key,
+  contact_rest_thickness,
+  contact_local,
+  contact_cell,
+  contact_friction,
+  contact_thickness,
+  contact_array_count
+};
+
+// Counts in contact.sizes.
+enum ContactSize : int { size_bodies, size_colliders, size_capacity, contact_size_count };
+
+template <class T>
+ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertices) {
+  TORCH_CHECK_VALUE(arrays.size() == contact_array_count, "contact must have ", int(contact_array_count),
+                    " arrays, got ", arrays.size(), "; compile the scene again");
+  const Place place{at::kCPU};
+  const int32* sizes = sizes_view(arrays[contact_sizes], contact_size_count);
+  ContactPlan<T> plan;
+  plan.bodies = sizes[size_bodies];
+  plan.colliders = sizes[size_colliders];
+  plan.capacity = sizes[size_capacity];
+  const auto array = [&](ContactArray which, at::ScalarType type, std::int64_t rows, std::int64_t width,
+                         const char* meaning) -> const void* {
+    check_array(arrays[which], type, rows, width, place, "contact", meaning);
+    return arrays[which].const_data_ptr();
+  };
+  const auto ints = [&](ContactArray which, std::int64_t rows, std::int64_t width, const char* meaning) {
+    return static_cast<const int32*>(array(which, at::kInt, rows, width, meaning));
+  };
+  const auto reals = [&](ContactArray which, std::int64_t rows, std::int64_t width, const char* meaning) {
+    return static_cast<const T*>(array(which, scalar_type<T>, rows, width, meaning));
+  };
+  const auto rows_of_array = [&](ContactArray which) { return arrays[which].dim() ? arrays[which].size(0) : 0; };
+  plan.vertices = int(rows_of_array(contact_body));
+  plan.body_vertices = int(body_vertices);
+  plan.triangles = int(rows_of_array(contact_triangle));
+  plan.edges = int(rows_of_array(contact_edge));
+  plan.points = int(rows_of_array(contact_point));
+  plan.rest_pairs = rows_of_array(contact_rest_key);
+  plan.triangle = ints(contact_triangle, plan.triangles, 3, "vertices of triangles");
+  plan.edge = ints(contact_edge, plan.edges, 2, "vertices of edges");
+  plan.point = ints(contact_point, plan.points, 1, "vertices of surfaces");
+  plan.body = ints(contact_body, plan.vertices, 1, "body of each vertex");
+  plan.collider = ints(contact_collider, plan.vertices, 1, "collider of each vertex");
+  plan.touches_itself = ints(contact_touches_itself, plan.bodies, 1, "whether bodies touch themselves");
+  plan.point_order = ints(contact_point_order, plan.points, 1, "leaves of a tree");
+  plan.triangle_order = ints(contact_triangle_order, plan.triangles, 1, "leaves of a tree");
+  plan.edge_order = ints(contact_edge_order, plan.edges, 1, "leaves of a tree");
+  plan.rest_key = static_cast<const std::int64_t*>(
+      array(contact_rest_key, at::kLong, plan.rest_pairs, 1, "keys of pairs that are close at rest"));
+  plan.rest_thickness = reals(contact_rest_thickness, plan.rest_pairs, 1, "their thickness [m]");
+  plan.local = reals(contact_local, plan.vertices - plan.body_vertices, 3, "points of colliders [m]");
+  plan.cell = reals(contact_cell, plan.vertices, 1, "mean edge of each vertex's body [m]");
+  plan.friction = reals(contact_friction, plan.bodies, plan.bodies, "friction of pairs of bodies");
+  plan.thickness = *reals(contact_thickness, 1, 1, "thickness [m]");
+  return plan;
+}
+
+template <class Backend, class T>
+ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at::TensorList history,
+                                  at::TensorList contact, const Settings& settings) {
+  StepCall<T> call;
+  const Place place{t.positions.device()};
+  call.plan = Backend::template plan_view<T>(t.plan, place);
+  call.batch = t.positions.size(0);
+  check_vertices(t.positions, call.plan.vertices);
+  TORCH_CHECK_VALUE(!settings.multilevel(), "contact_step takes Chebyshev and Jacobi, got another solver");
+  call.material = material_view<T>(call.plan, t.material, call.batch, place);
+  call.effects =
+      effects_view<T>(Backend::stencil_counts(call), call.plan.tets, t.material, call.batch, place);
+  call.effects.stiffness = call.material.stiffness;
+  check_tets(t.material[0], call.plan.tets);
+  call.settings = settings;
+  const Tensor x = t.positions.contiguous(), v = t.velocities.contiguous();
+  const Tensor f = t.forces ? t.forces->contiguous() : Tensor();
+  call.positions = x.const_data_ptr<T>();
+  call.velocities = v.const_data_ptr<T>();
+  call.forces = f.defined() ? f.const_data_ptr<T>() : nullptr;
+  call.out_positions = t.out_positions.mutable_data_ptr<T>();
+  call.out_velocities = t.out_velocities.mutable_data_ptr<T>();
+  call.info = t.info.mutable_data_ptr<double>();
+
+  ContactCall<T> of;
+  of.plan = contact_plan_view<T>(contact, call.plan.vertices);
+  const std::int64_t b = call.batch, c = of.plan.colliders, m = of.plan.capacity;
+  const at::ScalarType real = scalar_type<T>;
+  const auto check = [&](const Tensor& tensor, at::ScalarType type, at::IntArrayRef shape,
+                         const char* name, const char* meaning) {
+    check_storage(tensor, type, place, name, meaning);
+    TORCH_CHECK_VALUE(tensor.sizes() == shape, name, " must be ", shape, " (", meaning, "), got ",
+                      describe(tensor));
+  };
+  TORCH_CHECK_VALUE(history.size() == 3, "history must be poses, keys and forces, got ", history.size(),
+                    " arrays");
+  check(poses, real, {b, c, 7}, "poses", "of colliders at the step's end");
+  check(history[0], real, {b, c, 7}, "history.poses", "actual poses of colliders");
+  check(history[1], at::kLong, {b, m}, "history.keys", "pairs with forces");
+  check(history[2], real, {b, m, 4}, "history.forces", "N");
+  const Tensor info = at::empty({b, contact_info_count}, x.options().dtype(at::kDouble)),
+               held = at::empty({b, c}, x.options()), next_poses = at::empty({b, c, 7}, x.options()),
+               next_keys = at::empty({b, m}, history[1].options()),
+               next_forces = at::empty({b, m, 4}, x.options());
+  of.history = {history[0].const_data_ptr<T>(),          history[1].const_data_ptr<std::int64_t>(),
+                history[2].const_data_ptr<T>(),          next_poses.mutable_data_ptr<T>(),
+                next_keys.mutable_data_ptr<std::int64_t>(), next_forces.mutable_data_ptr<T>()};
+  of.poses = poses.const_data_ptr<T>();
+  of.info = info.mutable_data_ptr<double>();
+  of.held_back = held.mutable_data_ptr<T>();
+  if (b > 0) Backend::contact_step(call, of);
+  return {t.out_positions, t.out_velocities, t.info, info, held, next_poses, next_keys, next_forces};
+}
+
+template <class Backend>
+ContactOutputs contact_step(const Numbers& n, const Tensor& positions, const Tensor& velocities,
+                            const OptionalTensor& forces, const Tensor& poses, at::TensorList history,
+                            at::TensorList material, at::TensorList plan, at::TensorList contact) {
+  check_positions(positions, "positions");
+  check_state(velocities, positions, "velocities", "m/s");
+  if (forces) check_state(*forces, positions, "forces", "N");
+  const Tensor x = at::empty(positions.sizes(), positions.options()), v = at::empty_like(x);
+  const Tensor info = info_for(positions, {});
+  const StepTensors tensors{positions, velocities, forces, {}, material, plan, x, v, info};
+  const Settings settings = settings_of(n, false, 1, 1);
+  const ContactOutputs made =
+      positions.scalar_type() == at::kFloat
+          ? contact_step_typed<Backend, float>(tensors, poses, history, contact, settings)
+          : contact_step_typed<Backend, double>(tensors, poses, history, contact, settings);
+  if (n.report) report_step<Backend>(tensors, n);
+  return made;
+}
+
+template <class Backend>
+void register_contact_ops(torch::Library& m) {
+  m.impl("contact_step", unpacked<&contact_step<Backend>>);
+}
+
+}  // namespace pd

@@ -1,0 +1,414 @@
+// The contact of one environment in one step: every iterate is free of crossings, and so are straight ways between them.
+//
+// A search lists all pairs that may come near. No vertex leaves its ball, nor the half-spaces of its pairs: see
+// contact/pairs/half_space.h. Planes that the next iterate violates are made anew at the present one before.
+#pragma once
+#include "cpu/contact/hands.h"
+
+#include <cmath>
+
+namespace pd::inline PD_TARGET {
+
+constexpr int contact_sweeps = 4;   // of multipliers in an iteration
+constexpr int search_pause = 5;     // least iterations between searches
+constexpr double ball_reach = 1.2;  // of what a vertex wants; see ball_cells
+constexpr double ball_cells = 0.25;  // most radius of a ball, over the mean edge
+constexpr double least_yield = 1e-6;  // of the weights of a pair, on vertices that move freely
+
+template <class T>
+class ContactRun {
+ public:
+  using Places = std::vector<Vec3<T>>;
+
+  explicit ContactRun(const ContactPlan<T>& plan)
+      : plan_(plan), search_(plan), held_(plan.vertices), inverse_(plan.vertices) {
+    for (Places* places : {&begin_, &place_, &target_, &goal_, &shift_}) places->resize(plan.vertices);
+    is_surface_.assign(plan.vertices, 0);
+    for (int n = 0; n < plan.points; ++n) is_surface_[plan.point[n]] = 1;
+    for (int v = plan.body_vertices; v < plan.vertices; ++v) {
+      if (hands_.size() <= std::size_t(plan.collider[v])) hands_.push_back({{}, {}, v, v});
+      hands_.back().end = v + 1;
+    }
+    balls_.resize(plan.vertices);
+  }
+
+  const ContactPlan<T>& plan() const { return plan_; }
+  Places& place() { return place_; }             // of the present iterate
+  Places& target() { return target_; }           // of the next one, before contact
+  Places& goal() { return goal_; }               // of what moves by hand
+  std::vector<T>& inverse() { return inverse_; }  // 1 / D; 0 for what moves by hand
+  const PairList<T>& list() const { return list_; }
+  bool moves_by_hand(int vertex) const { return held_[vertex] != 0; }
+  bool was_cut(int vertex) const { return cut_[vertex] != 0; }
+  bool is_at_rest() const { return !cut_any_ && !waits_; }
+  const std::vector<Hand<T>>& hands() const { return hands_; }
+
+  double gap = HUGE_VAL;
+  std::int64_t most_pairs = 0, searches = 0, shortened = 0, frozen = 0;
+  bool overflows() const { return most_pairs > plan_.capacity; }
+
+  // A step begins at the places of bodies; poses are those of colliders, actual ones and those of the step's end.
+  void begin(const T* actual, const T* wanted, const std::int64_t* keys, const T* forces) {
+    for (std::size_t c = 0; c < hands_.size(); ++c) {
+      Hand<T>& hand = hands_[c];
+      hand.pose = Hand<T>::read(actual + 7 * c);
+      hand.goal = Hand<T>::read(wanted + 7 * c);
+      for (int v = hand.begin; v < hand.end; ++v) {
+        place_[v] = hand.pose.place(local_point(plan_, v));
+        goal_[v] = hand.goal.place(local_point(plan_, v));
+      }
+    }
+    for (int v = 0; v < plan_.vertices; ++v) held_[v] = !(inverse_[v] > T(0));
+    begin_ = place_;
+    known_.clear();
+    for (int n = 0; n < plan_.capacity && keys[n] >= 0; ++n) {
+      const T* f = forces + 4 * n;
+      known_.push_back({keys[n], {f[0], {f[1], f[2], f[3]}}});
+    }
+    gap = HUGE_VAL;
+    most_pairs = searches = shortened = frozen = 0;
+    searched_at_ = 0;
+    waits_ = false;
+  }
+
+  // Lists the pairs that may come near while no vertex leaves its ball.
+  void find() {
+    for (int v = 0; v < plan_.vertices; ++v) {
+      const Vec3<T> way = target_[v] - place_[v];
+      const T reach = T(ball_reach) * square_root(dot(way, way)) + (held_[v] ? T(0) : plan_.thickness),
+              most = T(ball_cells) * plan_.cell[v];
+      radius(v) = reach < most ? reach : most;
+      balls_[v].center = place_[v];
+    }
+    list_.pairs.clear();
+    std::int64_t count = 0;
+    search_.each_boxed(
+        [&](int v) { return Box<T>{place_[v], place_[v]}; },
+        [&](int v) { return radius(v) + T(0.5) * plan_.thickness; },
+        [&](int v) { return moves_by_hand(v); },
+        [&](ContactPair<T>& pair) {
+          Vec3<T> corner[4];
+          pair.corners(place_, corner);
+          const Closest<T> near = closest_points(pair.edges, corner);
+          if (!(near.distance <= reach_of(pair) + plan_.thickness)) return;
+          if (++count > plan_.capacity) return;
+          make_plane(pair, place_, target_, near, Vec3<T>{});
+          list_.pairs.push_back(pair);
+        });
+    // inside bodies nothing meets
+    for (int v = 0; v < plan_.vertices; ++v)
+      if (!is_surface_[v]) radius(v) = T(HUGE_VAL);
+    most_pairs = count > most_pairs ? count : most_pairs;
+    ++searches;
+    list_.index(plan_.vertices);
+    look();
+    for (ContactPair<T>& pair : list_.pairs) {
+      const auto at = std::lower_bound(known_.begin(), known_.end(), pair.key,
+                                       [](const Known& a, std::int64_t key) { return a.key < key; });
+      if (at == known_.end() || at->key != pair.key) continue;
+      pair.force = {at->force.normal, tangential(at->force.tangential, pair.normal)};
+    }
+    checked_ = false;
+  }
+
+  // Closest points and normals of all pairs at the present iterate.
+  void look() {
+    for (ContactPair<T>& pair : list_.pairs) {
+      Vec3<T> corner[4];
+      pair.corners(place_, corner);
+      pair.near = closest_points(pair.edges, corner);
+      const T d = pair.near.distance;
+      pair.normal = d > T(1e-9) ? (T(1) / d) * pair.near.diff : pair.plane.normal;
+    }
+  }
+
+  // E + psi before and now, both by the multipliers of now; the energies are those of the bodies alone.
+  struct Merits {
+    double before, now;
+    bool known;
+  };
+  Merits check(double energy) {
+    Merits merits{last_energy_, energy, checked_};
+    for (ContactPair<T>& pair : list_.pairs) {
+      const T yielding = yield_of(pair);
+      const Vec3<T> slip = slip_of(pair);
+      const auto psi = [&](T distance, const Vec3<T>& slipped) {
+        return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction, distance, slipped);
+      };
+      if (checked_) merits.before += psi(pair.checked_distance, pair.checked_slip);
+      merits.now += psi(pair.near.distance, slip);
+      pair.checked_distance = pair.near.distance;
+      pair.checked_slip = slip;
+    }
+    last_energy_ = energy;
+    checked_ = true;
+    return merits;
+  }
+
+  // The proximal step: multipliers in the metric of D, and what they move. c = theta omega.
+  void prox(T c) {
+    active_.clear();
+    for (int p = 0; p < int(list_.pairs.size()); ++p) {
+      ContactPair<T>& pair = list_.pairs[p];
+      if (!(freedom_of(pair) > T(least_yield))) {
+        pair.force = {};  // nothing can yield
+        continue;
+      }
+      Vec3<T> corner[4];
+      pair.corners(target_, corner);
+      const bool touches = dot(pair.normal, combined(pair.near.weight, corner)) < pair.thickness;
+      if (touches || pair.force.normal > T(0)) active_.push_back(p);
+    }
+    if (active_.empty()) return;
+    weights_.assign(plan_.vertices, T(0));
+    for (int p : active_) {
+      const ContactPair<T>& pair = list_.pairs[p];
+      for (int a = 0; a < 4; ++a)
+        weights_[pair.vertex[a]] = weights_[pair.vertex[a]] + absolute(pair.near.weight[a]);
+    }
+    for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
+      push(c);
+      for (int p : active_) {
+        ContactPair<T>& pair = list_.pairs[p];
+        T sum(0);
+        for (int a = 0; a < 4; ++a) {
+          const int v = pair.vertex[a];
+          sum = multiply_add(absolute(pair.near.weight[a]) * weights_[v], inverse_[v], sum);
+        }
+        Vec3<T> between[4], before[4];
+        pair.corners(shift_, between);
+        pair.corners(begin_, before);
+        pair.force = advance(pair.force, T(1) / (c * sum), pair.thickness, pair.friction, pair.normal,
+                             combined(pair.near.weight, between), combined(pair.near.weight, before));
+      }
+    }
+    push(c);
+    for (int p : active_)
+      for (int v : list_.pairs[p].vertex) target_[v] = shift_[v];
+  }
+
+  // Goes as near to the targets as the promise allows. `walls(vertex, visit)`: half-spaces of the scene.
+  template <class Walls>
+  void move(const Walls& walls) {
+    refresh();
+    cut_.assign(plan_.vertices, 0);
+    touched_ = cut_any_ = false;
+    shift_ = place_;
+    for (int v = 0; v < plan_.vertices; ++v) {
+      if (held_[v]) continue;
+      if (list_.is_stuck(v)) {
+        cut(v);
+        ++frozen;
+        continue;
+      }
+      const LimitedPlace<T> to =
+          limit(target_[v], place_[v], balls_[v], [&](const auto& visit) { each_space(v, walls, visit); });
+      shift_[v] = to.place;
+      touched_ = touched_ || to.outside;
+      if (to.shortened) cut(v);
+    }
+    move_hands(walls);
+    std::swap(place_, shift_);
+  }
+
+  // Whether a search is due after iteration k; it also says whether it waits for the pause.
+  bool asks_for_search(int k) {
+    waits_ = touched_;
+    if (!touched_ || k - searched_at_ < search_pause) return false;
+    searched_at_ = k;
+    return true;
+  }
+
+  // Forces of all pairs are known to the next search.
+  void remember() {
+    known_.clear();
+    for (const ContactPair<T>& pair : list_.pairs)
+      if (has_force(pair)) known_.push_back({pair.key, pair.force});
+  }
+
+  // calls visit(key, force), in the order of the keys
+  template <class Visit>
+  void each_force(const Visit& visit) const {
+    for (const Known& known : known_) visit(known.key, known.force);
+  }
+
+  // calls visit(vertex) for vertices of pairs between bodies with a force that is known, one of each side
+  template <class Visit>
+  void each_known(const Visit& visit) const {
+    const std::int64_t first_edge = std::int64_t(plan_.vertices) * plan_.triangles;
+    for (const Known& known : known_) {
+      const bool edges = known.key >= first_edge;
+      const std::int64_t key = edges ? known.key - first_edge : known.key,
+                         count = edges ? plan_.edges : plan_.triangles;
+      const int a = edges ? plan_.edge[2 * (key / count)] : int(key / count),
+                b = edges ? plan_.edge[2 * (key % count)] : plan_.triangle[3 * (key % count)];
+      if (plan_.body[a] == plan_.body[b]) continue;
+      visit(a);
+      visit(b);
+    }
+  }
+
+  // the same for all pairs in the list
+  template <class Visit>
+  void each_listed(const Visit& visit) const {
+    for (const ContactPair<T>& pair : list_.pairs) {
+      visit(pair.vertex[0]);
+      visit(pair.vertex[3]);
+    }
+  }
+
+  // At the step's end: least d / r.
+  void measure() {
+    look();
+    gap = HUGE_VAL;
+    for (const ContactPair<T>& pair : list_.pairs) {
+      const double share = double(pair.near.distance / pair.thickness);
+      gap = share < gap ? share : gap;
+    }
+  }
+
+  double held_back(int begin, int end) const {
+    double most = 0;
+    for (int v = begin; v < end; ++v) {
+      if (!held_[v]) continue;
+      const Vec3<T> left = place_[v] - goal_[v];
+      const double length = double(square_root(dot(left, left)));
+      most = length > most ? length : most;
+    }
+    return most;
+  }
+
+  static bool has_force(const ContactPair<T>& pair) {
+    const Vec3<T>& t = pair.force.tangential;
+    return pair.force.normal > T(0) || t.x != T(0) || t.y != T(0) || t.z != T(0);
+  }
+
+  // for the approach
+  PairSearch<T>& search() { return search_; }
+  std::vector<Hand<T>>& hands_to_move() { return hands_; }
+
+ private:
+  struct Known {
+    std::int64_t key;
+    Multiplier<T> force;
+  };
+
+  T& radius(int v) { return balls_[v].radius; }
+
+  T reach_of(const ContactPair<T>& pair) const {
+    T reach[2] = {T(0), T(0)};
+    for (int a = 0; a < 4; ++a) {
+      T& side = reach[pair.on_a(a) ? 0 : 1];
+      side = std::max(side, balls_[pair.vertex[a]].radius);
+    }
+    return reach[0] + reach[1];
+  }
+
+  T yield_of(const ContactPair<T>& pair) const {
+    T sum(0);
+    for (int a = 0; a < 4; ++a)
+      sum = multiply_add(pair.near.weight[a] * pair.near.weight[a], inverse_[pair.vertex[a]], sum);
+    return sum;
+  }
+
+  T freedom_of(const ContactPair<T>& pair) const {
+    T sum(0);
+    for (int a = 0; a < 4; ++a)
+      if (inverse_[pair.vertex[a]] > T(0)) sum = sum + absolute(pair.near.weight[a]);
+    return sum;
+  }
+
+  Vec3<T> slip_of(const ContactPair<T>& pair) const {
+    Vec3<T> moved[4];
+    for (int a = 0; a < 4; ++a) moved[a] = place_[pair.vertex[a]] - begin_[pair.vertex[a]];
+    return tangential(combined(pair.near.weight, moved), pair.normal);
+  }
+
+  // targets, shifted by the forces of active pairs
+  void push(T c) {
+    for (int p : active_)
+      for (int v : list_.pairs[p].vertex) shift_[v] = target_[v];
+    for (int p : active_) {
+      const ContactPair<T>& pair = list_.pairs[p];
+      const Vec3<T> force = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
+      for (int a = 0; a < 4; ++a) {
+        const int v = pair.vertex[a];
+        shift_[v] = multiply_add(c * pair.near.weight[a] * inverse_[v], force, shift_[v]);
+      }
+    }
+  }
+
+  // Planes that targets violate are made anew at the present iterate.
+  void refresh() {
+    for (ContactPair<T>& pair : list_.pairs) {
+      bool broken = pair.plane.frozen;
+      for (int a = 0; a < 4; ++a) {
+        const T height = dot(pair.plane.normal, target_[pair.vertex[a]]);
+        broken = broken || (pair.on_a(a) ? height < pair.plane.above : height > pair.plane.below);
+      }
+      if (broken) make_plane(pair, place_, target_, pair.near, pair.plane.normal);
+    }
+  }
+
+  template <class Walls, class Visit>
+  void each_space(int v, const Walls& walls, const Visit& visit) const {
+    list_.each_space(v, visit);
+    const T margin = place_margin(place_[v]);
+    walls(v, place_[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
+  }
+
+  void cut(int v) {
+    cut_[v] = 1;
+    cut_any_ = true;
+    ++shortened;
+  }
+
+  template <class Walls>
+  void move_hands(const Walls& walls) {
+    const auto allowed = [&](int v, const Vec3<T>& to) {
+      return is_allowed(to, balls_[v], [&](const auto& visit) { each_space(v, walls, visit); });
+    };
+    for (int v = 0; v < plan_.body_vertices; ++v) {
+      if (!held_[v]) continue;
+      const Vec3<T> way = goal_[v] - place_[v];
+      const auto at = [&](T share) {
+        return share < T(1) ? multiply_add(share, way, place_[v]) : goal_[v];
+      };
+      const T share = list_.is_stuck(v) ? T(0) : largest_share<T>([&](T s) { return allowed(v, at(s)); });
+      shift_[v] = share > T(0) ? at(share) : place_[v];
+      if (share < T(1)) cut(v);
+    }
+    for (Hand<T>& hand : hands_) {
+      bool stuck = false;
+      for (int v = hand.begin; v < hand.end; ++v) stuck = stuck || list_.is_stuck(v);
+      const Screw<T> screw(hand.pose, hand.goal);
+      const T share = stuck ? T(0) : largest_share<T>([&](T s) {
+        const Pose<T> pose = screw.at(s);
+        for (int v = hand.begin; v < hand.end; ++v)
+          if (!allowed(v, pose.place(local_point(plan_, v)))) return false;
+        return true;
+      });
+      hand.pose = screw.at(share);
+      for (int v = hand.begin; v < hand.end; ++v) {
+        shift_[v] = hand.pose.place(local_point(plan_, v));
+        if (share < T(1)) cut(v);
+      }
+    }
+  }
+
+  const ContactPlan<T>& plan_;
+  PairSearch<T> search_;
+  PairList<T> list_;
+  std::vector<Hand<T>> hands_;
+  std::vector<char> held_, is_surface_, cut_;
+  std::vector<T> inverse_, weights_;
+  Places begin_, place_, target_, goal_, shift_;
+  std::vector<Ball<T>> balls_;
+  std::vector<Known> known_;
+  std::vector<int> active_;
+  double last_energy_ = 0;
+  bool checked_ = false, touched_ = false, cut_any_ = false, waits_ = false;
+  int searched_at_ = 0;
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,250 @@
+// Runner of a step with contact between bodies on the CPU: one environment by one thread.
+#pragma once
+#include "cpu/contact/approach.h"
+#include "cpu/step/stepper.h"
+
+namespace pd::inline PD_TARGET {
+
+// `HasContacts`: with planes and spheres of the scene, see solver/vertex.h.
+template <class T, bool HasContacts>
+class ContactStepper : public Stepper<Single<T>, HasContacts> {
+  using Lanes = Single<T>;
+  using Base = Stepper<Lanes, HasContacts>;
+  using Value = typename Lanes::Value;
+  using Sum = Sums<Lanes>;
+  using Base::call_, Base::contacts_, Base::done_, Base::least_, Base::next_omega_, Base::plan_,
+      Base::schedule_, Base::set_, Base::stop_, Base::sweep_, Base::theta_, Base::used_, Base::vertex,
+      Base::w_;
+
+ public:
+  ContactStepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
+                 const Team& team, std::int64_t environment, const ContactCall<T>& contact,
+                 ContactRun<T>& run, Approach<T>& approach)
+      : Base(call, work, scratch, team, environment),
+        contact_(contact),
+        run_(run),
+        approach_(approach),
+        environment_(environment),
+        inside_(plan_.vertices),
+        touches_(std::max(1, plan_.components)) {
+    for (int i = 0; i < plan_.vertices; ++i) inside_[plan_.vertex_order[i]] = i;
+  }
+
+  void rollout() {
+    this->load();
+    this->assemble_diagonal();
+    step(*this, set_);
+    if (!this->is_ended()) this->store(0);
+    write();
+  }
+
+  void start() {
+    Base::start();
+    const ContactPlan<T>& plan = run_.plan();
+    for (int i = 0; i < plan_.vertices; ++i) {
+      const int v = plan_.vertex_order[i];
+      run_.place()[v] = place_of(i, Value{});
+      run_.inverse()[v] = w_.inverse[i];
+      run_.goal()[v] = place_of(i, w_.target[i]);
+    }
+    const std::int64_t poses = environment_ * plan.colliders * 7, row = environment_ * plan.capacity;
+    run_.begin(contact_.history.poses + poses, contact_.poses + poses, contact_.history.keys + row,
+               contact_.history.forces + 4 * row);
+    begun_ = false;
+  }
+
+  // Approach, search and the first iterate, as near to the corrected guess as the promise allows. At the end bodies that
+  // touch no other are corrected again.
+  void align() {
+    if (!begun_) {
+      begun_ = true;
+      correct([&](const auto& visit) { run_.each_known(visit); });
+      want([&](int i) { return w_.u[i]; });
+      approach_.move(run_, [&](int v) { return mass(v); }, walls());
+      run_.find();
+      go();
+      for (int i = 0; i < plan_.vertices; ++i) w_.before[i] = w_.u[i];
+      check_at_ = 0;
+      return;
+    }
+    if (plan_.components == 0) return;
+    correct([&](const auto& visit) { run_.each_listed(visit); });
+    want([&](int i) { return w_.u[i]; });
+    go();
+  }
+
+  void iterate(int k) {
+    const T omega(next_omega_[0]);
+    const bool guards = schedule_[0].kind == ScheduleKind::guarded && (k - check_at_) % guard_period == 0;
+    run_.look();
+    sweep_.run(k & 1, elastic_gradient<true>(), [&](std::int64_t i, const Value& force, Sum& sums) {
+      const auto v = vertex(i);
+      sums.energy = v.add_energy(w_.u[i], sums.energy);
+      free_[i] = accelerate(w_.u[i], w_.before[i], v.gradient(w_.u[i], force),
+                            theta_ * w_.inverse[i], omega);
+    });
+    ++used_[0];
+    next_omega_[0] = schedule_[0].next(k + 1);
+    if (guards) guard(double(this->total(k & 1).energy));
+    want([&](int i) { return free_[i]; });
+    run_.prox(theta_ * omega);
+    if constexpr (HasContacts) leave_walls();
+    const double change = go();
+    if (set_.tolerance > 0) stop(change, omega);
+    if (k + 1 < set_.iterations && run_.asks_for_search(k)) {
+      run_.remember();
+      run_.find();
+      check_at_ = k + 1;
+    }
+  }
+
+ private:
+  Vec3<T> place_of(std::int64_t i, const Value& u) const { return Lanes::vec3(w_.x[i] + u); }
+
+  double mass(int v) const { return double(call_.material.masses.of(environment_)[v]); }
+
+  // Targets of the next move: displacements of bodies, and the goals of what moves by hand.
+  template <class Displacement>
+  void want(const Displacement& displacement) {
+    const ContactPlan<T>& plan = run_.plan();
+    for (int i = 0; i < plan_.vertices; ++i) {
+      const int v = plan_.vertex_order[i];
+      run_.target()[v] = run_.moves_by_hand(v) ? run_.goal()[v] : place_of(i, displacement(i));
+    }
+    for (int v = plan.body_vertices; v < plan.vertices; ++v) run_.target()[v] = run_.goal()[v];
+  }
+
+  // The coarse correction of components without a vertex of each_touching(visit).
+  template <class Each>
+  void correct(const Each& each_touching) {
+    for (int i = 0; i < plan_.vertices; ++i) free_[i] = w_.u[i];
+    Base::align();
+    std::fill(touches_.begin(), touches_.end(), 0);
+    each_touching([&](int v) {
+      const int g = v < int(inside_.size()) ? plan_.vertex_component[inside_[v]] : -1;
+      if (g >= 0) touches_[g] = 1;
+    });
+    for (int i = 0; i < plan_.vertices; ++i) {
+      const int g = plan_.vertex_component[i];
+      if (g >= 0 && touches_[g]) w_.u[i] = free_[i];
+    }
+  }
+
+  // calls visit(normal, bound) for planes and spheres of the scene, no deeper than at the place of a vertex
+  auto walls() const {
+    return [this](int v, const Vec3<T>& place, const auto& visit) {
+      if (!HasContacts || v >= run_.plan().body_vertices || run_.moves_by_hand(v)) return;
+      const auto no_deeper = [&](const Vec3<T>& normal, T bound) {
+        const T height = dot(normal, place);
+        visit(normal, bound < height ? bound : height);
+      };
+      for (int n = 0; n < contacts_.plane_count; ++n)
+        no_deeper(contacts_.planes[n].normal, contacts_.planes[n].height);
+      for (int n = 0; n < contacts_.sphere_count; ++n) {
+        const Sphere<T>& sphere = contacts_.spheres[n];
+        const Vec3<T> normal = outward(sphere, place);
+        no_deeper(normal, dot(normal, sphere.center) + sphere.radius);
+      }
+    };
+  }
+
+  // Targets out of the planes and spheres of the scene, with their friction.
+  void leave_walls() {
+    for (int i = 0; i < plan_.vertices; ++i) {
+      Vec3<T>& target = run_.target()[plan_.vertex_order[i]];
+      const Value u = Lanes::value(target) - w_.x[i];
+      const Value out = vertex(i).project(contacts_, u, w_.u[i]);
+      target = place_of(i, out);
+    }
+  }
+
+  // Moves toward the targets; returns the square of the change, or infinity while something is held up.
+  double go() {
+    run_.move(walls());
+    double change = 0;
+    for (int i = 0; i < plan_.vertices; ++i) {
+      const int v = plan_.vertex_order[i];
+      const Value u = w_.u[i], next = Lanes::value(run_.place()[v]) - w_.x[i], way = next - u;
+      w_.u[i] = next;
+      w_.before[i] = run_.was_cut(v) ? next : u;
+      change += double(dot(Lanes::vec3(way), Lanes::vec3(way)));
+    }
+    return run_.is_at_rest() ? change : HUGE_VAL;
+  }
+
+  void guard(double twice_energy) {
+    const auto merits = run_.check(0.5 * twice_energy);
+    Schedule& schedule = schedule_[0];
+    schedule.last_energy = merits.known ? merits.before : HUGE_VAL;
+    schedule.check(merits.now);
+  }
+
+  void stop(double change, T omega) {
+    double displacement = 0;
+    for (int i = 0; i < plan_.vertices; ++i) {
+      const Vec3<T> way = Lanes::vec3(w_.u[i] - w_.target[i]);
+      displacement += double(dot(way, way));
+    }
+    const bool met = stop_[0].is_met(set_.tolerance, schedule_[0].error_share(double(omega)), change, displacement);
+    done_[0] = met && change < HUGE_VAL;
+  }
+
+  // Poses, forces and numbers of the contact, for the caller. An overflow takes the step back.
+  void write() {
+    const ContactPlan<T>& plan = run_.plan();
+    run_.measure();
+    const std::int64_t row = environment_ * plan.capacity;
+    std::int64_t* key = contact_.history.next_keys + row;
+    T* force = contact_.history.next_forces + 4 * row;
+    run_.remember();
+    int count = 0;
+    run_.each_force([&](std::int64_t k, const Multiplier<T>& of) {
+      key[count] = k;
+      T* const f = force + 4 * count++;
+      f[0] = of.normal, f[1] = of.tangential.x, f[2] = of.tangential.y, f[3] = of.tangential.z;
+    });
+    for (; count < plan.capacity; ++count) {
+      key[count] = -1;
+      std::fill_n(force + 4 * count, 4, T(0));
+    }
+    for (int c = 0; c < plan.colliders; ++c) {
+      const Hand<T>& hand = run_.hands()[c];
+      const std::int64_t at = environment_ * plan.colliders + c;
+      Hand<T>::write(hand.pose, contact_.history.next_poses + 7 * at);
+      contact_.held_back[at] = T(run_.held_back(hand.begin, hand.end));
+    }
+    double* info = contact_.info + environment_ * contact_info_count;
+    info[contact_gap] = run_.gap;
+    info[contact_overflow] = double(std::max<std::int64_t>(0, run_.most_pairs - plan.capacity));
+    info[contact_pairs] = double(run_.most_pairs);
+    info[contact_searches] = double(run_.searches);
+    info[contact_shortened] = double(run_.shortened);
+    info[contact_frozen] = double(run_.frozen);
+    info[contact_pins_held_back] = run_.held_back(0, plan.body_vertices);
+    if (run_.overflows()) take_back();
+  }
+
+  // Positions and velocities stay; so do poses and forces.
+  void take_back() {
+    const ContactPlan<T>& plan = run_.plan();
+    const std::int64_t count = std::int64_t(plan_.vertices) * 3, row = environment_ * plan.capacity,
+                       poses = environment_ * plan.colliders * 7;
+    std::copy_n(call_.positions + environment_ * count, count, call_.out_positions + environment_ * count);
+    std::copy_n(call_.velocities + environment_ * count, count, call_.out_velocities + environment_ * count);
+    std::copy_n(contact_.history.keys + row, plan.capacity, contact_.history.next_keys + row);
+    std::copy_n(contact_.history.forces + 4 * row, 4 * plan.capacity, contact_.history.next_forces + 4 * row);
+    std::copy_n(contact_.history.poses + poses, 7 * plan.colliders, contact_.history.next_poses + poses);
+  }
+
+  const ContactCall<T>& contact_;
+  ContactRun<T>& run_;
+  Approach<T>& approach_;
+  std::int64_t environment_;
+  std::vector<Value> free_ = std::vector<Value>(plan_.vertices);  // the next iterate before contact
+  std::vector<int> inside_;        // internal number of the user's vertices
+  std::vector<char> touches_;      // [components]
+  int check_at_ = 0;
+  bool begun_ = false;
+};
+
+}  // namespace pd::inline PD_TARGET
