@@ -77,9 +77,9 @@ def _allowed(
     count = len(deformable)
     end = way(torch.ones(count, dtype=positions.dtype))
     # a helix leaves the box of its ends by half a chord at most, for a turn below pi
-    bow = torch.where(deformable[surfaces.body], 0.0, 0.5 * (end - positions).norm(dim=1))[:, None]
-    reach = bow + 0.5 * surfaces.thickness
-    pairs = boxed_pairs(surfaces, torch.minimum(positions, end) - reach, torch.maximum(positions, end) + reach)
+    bow = torch.where(deformable[surfaces.body], 0.0, 0.5 * (end - positions).norm(dim=1))
+    low, high = torch.minimum(positions, end), torch.maximum(positions, end)
+    pairs = boxed_pairs(surfaces, low, high, bow + 0.5 * surfaces.thickness)
     pairs = pairs.chosen(surfaces.body[pairs.vertices[:, 0]] != surfaces.body[pairs.vertices[:, 3]])
     near = closest(pairs.corners(positions), pairs.points)
     planes = make_planes(pairs, positions, end, near)

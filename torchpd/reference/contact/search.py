@@ -12,15 +12,18 @@ from .surfaces import Pairs, Surfaces, joined
 __all__ = ["boxed_pairs", "near_pairs"]
 
 
-def boxed_pairs(surfaces: Surfaces, low: Tensor, high: Tensor) -> Pairs:
-    """Pairs whose sides' boxes meet; each vertex has a box [N, 3] m, each triangle and edge that of its vertices."""
-    faces, lines = surfaces.triangles, surfaces.edges
-    points = surfaces.vertices
-    vertex, triangle = overlaps(low[points], high[points], low[faces].amin(1), high[faces].amax(1))
-    edge_low, edge_high = low[lines].amin(1), high[lines].amax(1)
-    first, second = overlaps(edge_low, edge_high, edge_low, edge_high)
+def boxed_pairs(surfaces: Surfaces, low: Tensor, high: Tensor, reach: Tensor) -> Pairs:
+    """Pairs whose sides' boxes meet: those of their vertices' boxes [N, 3] m and of the largest reach [N] m of these."""
+    faces, lines, points = surfaces.triangles, surfaces.edges, surfaces.vertices[:, None]
+
+    def boxes(sides: Tensor) -> tuple[Tensor, Tensor]:
+        widest = reach[sides].amax(dim=1)[:, None]
+        return low[sides].amin(dim=1) - widest, high[sides].amax(dim=1) + widest
+
+    vertex, triangle = overlaps(*boxes(points), *boxes(faces))
+    first, second = overlaps(*boxes(lines), *boxes(lines))
     once = first < second
-    return joined(surfaces.point_pairs(points[vertex], triangle), surfaces.edge_pairs(first[once], second[once]))
+    return joined(surfaces.point_pairs(points[vertex, 0], triangle), surfaces.edge_pairs(first[once], second[once]))
 
 
 def near_pairs(surfaces: Surfaces, positions: Tensor, radii: Tensor) -> Pairs:
@@ -28,8 +31,7 @@ def near_pairs(surfaces: Surfaces, positions: Tensor, radii: Tensor) -> Pairs:
 
     No vertex leaves the ball of its radius. So the sides of every other pair stay r apart, and f.
     """
-    reach = (radii + 0.5 * surfaces.thickness)[:, None]
-    pairs = boxed_pairs(surfaces, positions - reach, positions + reach)
+    pairs = boxed_pairs(surfaces, positions, positions, radii + 0.5 * surfaces.thickness)
     radius = radii[pairs.vertices]
     on_a = torch.where(pairs.on_a, radius, 0.0).amax(dim=1)
     on_b = torch.where(pairs.on_a, 0.0, radius).amax(dim=1)
