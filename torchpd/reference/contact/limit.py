@@ -17,7 +17,7 @@ from torch import Tensor
 from .planes import Planes
 from .surfaces import Pairs
 
-__all__ = ["Balls", "HalfSpaces", "Limited", "Walls", "into_balls", "largest_shares", "limit"]
+__all__ = ["Balls", "HalfSpaces", "Limited", "Walls", "halved", "into_balls", "largest_shares", "limit"]
 
 ROUNDS = 4  # of projections; 1 and 16 end alike
 _HALVINGS = 30  # of the interval of a share
@@ -188,9 +188,14 @@ def largest_shares(
         fine[group[bad & asked]] = False
         return fine
 
-    least, most = torch.zeros(count, dtype=balls.radii.dtype), torch.ones(count, dtype=balls.radii.dtype)
     held = torch.zeros(count, dtype=torch.bool)
     held[group[stuck & asked]] = True
+    return halved(allowed, held, balls.radii.dtype)
+
+
+def halved(allowed: Callable[[Tensor], Tensor], held: Tensor, dtype: torch.dtype) -> Tensor:
+    """Largest shares [n] in [0, 1] that are `allowed`, by halving; 0 of what is `held` [n]."""
+    least, most = torch.zeros(len(held), dtype=dtype), torch.ones(len(held), dtype=dtype)
     whole = allowed(most) & ~held
     if whole.all():
         return most
@@ -198,4 +203,4 @@ def largest_shares(
         middle = torch.where(whole, 1.0, torch.where(held, 0.0, 0.5 * (least + most)))
         fine = allowed(middle)
         least, most = torch.where(fine, middle, least), torch.where(fine, most, middle)
-    return torch.where(whole, 1.0, least)
+    return torch.where(whole, 1.0, torch.where(held, 0.0, least))

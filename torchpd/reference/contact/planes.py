@@ -15,7 +15,17 @@ from torch import Tensor
 from .distance import Closest
 from .surfaces import Pairs
 
-__all__ = ["Planes", "divide", "gap_along", "make_planes", "margins", "separate"]
+__all__ = [
+    "Planes",
+    "best_of",
+    "candidates",
+    "divide",
+    "gap_along",
+    "gap_bounds",
+    "make_planes",
+    "margins",
+    "separate",
+]
 
 
 @dataclass(frozen=True)
@@ -51,21 +61,36 @@ def gap_along(normals: Tensor, corners: Tensor, points: int) -> Tensor:
     return on_a - on_b
 
 
-def separate(corners: Tensor, points: int, near: Closest, hand: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-    """Direction of the largest gap among the candidates [m, 3], that gap [m] m, and the bound [m] m of its rounding.
+def candidates(corners: Tensor, points: int, near: Closest, *others: Tensor) -> Tensor:
+    """Unit directions [m, k, 3] that may separate the sides; zero where one has no length.
 
-    The candidates: between the closest points; the same made orthogonal to the edges that carry them, since rounding
-    turns it by ulp / d, over an edge's length more than the gap; the face's or the common normal; the one at `hand`.
+    Between the closest points; the same made orthogonal to the edges that carry them, since rounding turns it by
+    ulp / d, over an edge's length more than the gap; the face's or the common normal; `others` [m, 3].
     """
-    candidates = [near.diff, _squared(corners, points, near), _normals(corners, points, near.diff)]
-    among = torch.stack([*candidates, *([] if hand is None else [hand])], dim=1)
+    own = [near.diff, _squared(corners, points, near), _normals(corners, points, near.diff)]
+    among = torch.stack([*own, *others], dim=1)
     length = among.norm(dim=2, keepdim=True)
-    among = torch.where(length > 0.0, among / torch.where(length > 0.0, length, torch.ones_like(length)), 0.0)
-    gaps = torch.where(length[:, :, 0] > 0.0, gap_along(among, corners, points), -torch.inf)
-    best = gaps.argmax(dim=1)
-    number = torch.arange(len(corners))
+    return torch.where(length > 0.0, among / torch.where(length > 0.0, length, torch.ones_like(length)), 0.0)
+
+
+def best_of(among: Tensor, gaps: Tensor) -> tuple[Tensor, Tensor]:
+    """The direction [m, 3] of the largest of the gaps [m, k] m, and that gap; the first of equals."""
+    gaps = torch.where((among != 0.0).any(dim=2), gaps, -torch.inf)
+    best, number = gaps.argmax(dim=1), torch.arange(len(gaps))
+    return among[number, best], gaps[number, best]
+
+
+def gap_bounds(corners: Tensor) -> Tensor:
+    """Rounding [m] m of `gap_along`: 4 eps of the largest |x_a - x_0|_1."""
     reach = (corners[:, 1:] - corners[:, :1]).abs().sum(dim=2).amax(dim=1)
-    return among[number, best], gaps[number, best], 4.0 * torch.finfo(corners.dtype).eps * reach
+    return 4.0 * torch.finfo(corners.dtype).eps * reach
+
+
+def separate(corners: Tensor, points: int, near: Closest, *others: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Direction of the largest gap among `candidates` [m, 3], that gap [m] m, and the bound [m] m of its rounding."""
+    among = candidates(corners, points, near, *others)
+    normals, gap = best_of(among, gap_along(among, corners, points))
+    return normals, gap, gap_bounds(corners)
 
 
 def _normals(corners: Tensor, points: int, diff: Tensor) -> Tensor:
@@ -119,8 +144,8 @@ def divide(
     return Planes(normals, above, below, margin, gap <= bound)
 
 
-def make_planes(pairs: Pairs, positions: Tensor, want: Tensor, near: Closest, hand: Tensor | None = None) -> Planes:
-    """Planes of pairs at positions [N, 3] m that want to go to `want` [N, 3] m."""
+def make_planes(pairs: Pairs, positions: Tensor, want: Tensor, near: Closest, *hand: Tensor) -> Planes:
+    """Planes of pairs at positions [N, 3] m that want to go to `want` [N, 3] m; `hand` has the directions at hand."""
     corners = pairs.corners(positions)
-    normals, gap, bound = separate(corners, pairs.points, near, hand)
+    normals, gap, bound = separate(corners, pairs.points, near, *hand)
     return divide(corners, pairs.corners(want), pairs.on_a, pairs.floor, normals, gap, bound)
