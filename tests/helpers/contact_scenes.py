@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sheets import sheet
 
 import torchpd as pd
-from torchpd.reference.contact import Collider, ContactScene, ContactStep, contact_scene, contact_step
+from torchpd.reference.contact import Collider, ContactScene, ContactStep, contact_scene, contact_step, crossings
 from torchpd.scene import Part, SceneValues
 from torchpd.scene.springs import spring_group
 
@@ -54,6 +54,41 @@ class ContactCase:
     def last(self, count: int, iterations: int, **options: Any) -> ContactStep:
         *_, step = self.steps(count, iterations, **options)
         return step
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A course, and how often its iterates crossed."""
+
+    steps: list[ContactStep]
+    crossed: int  # iterates with crossings
+    iterates: int
+
+    @property
+    def gap(self) -> float:
+        """Least d / r at the end of a step."""
+        return min(step.gap for step in self.steps)
+
+    @property
+    def finite(self) -> bool:
+        return all(bool(step.positions.isfinite().all() & step.velocities.isfinite().all()) for step in self.steps)
+
+
+def watched(case: ContactCase, count: int, iterations: int) -> Watched:
+    """Run a course, and look for crossings at every iterate by exact signs."""
+    crossed = []
+
+    def observe(_: int, places: torch.Tensor) -> None:
+        crossed.append(len(crossings(case.scene.surfaces, places)) > 0)
+
+    steps = list(case.steps(count, iterations, observe=observe))
+    return Watched(steps, sum(crossed), len(crossed))
+
+
+def mean_of(case: ContactCase, each_vertex: torch.Tensor) -> Array:
+    """Mean [3] of a quantity of the deformable vertices [V, 3], weighted by mass."""
+    masses = case.scene.values.masses
+    return np.asarray(masses @ each_vertex.double().numpy() / masses.sum())
 
 
 def poses_of(*places: tuple[float, float, float], turns: Any = None) -> Array:

@@ -13,7 +13,7 @@ __all__ = ["boxed_pairs", "near_pairs"]
 
 
 def boxed_pairs(surfaces: Surfaces, low: Tensor, high: Tensor, reach: Tensor) -> Pairs:
-    """Pairs whose sides' boxes meet: those of their vertices' boxes [N, 3] m and of the largest reach [N] m of these."""
+    """Pairs whose sides' boxes meet: around their vertices' boxes [N, 3] m, by the largest reach [N] m of these."""
     faces, lines, points = surfaces.triangles, surfaces.edges, surfaces.vertices[:, None]
 
     def boxes(sides: Tensor) -> tuple[Tensor, Tensor]:

@@ -142,8 +142,8 @@ class _Run:
         self.hands = Hands(scene, scene.poses if history is None else history.poses, poses, targets)
         self.keys = history.keys if history is not None else torch.zeros(0, dtype=torch.int64)
         self.known = Multipliers.none(0, dtype) if history is None else Multipliers(history.normal, history.tangential)
-        self.checked: tuple[float, Tensor, Tensor] | None = None  # E, gaps and slips of the last check of this list
-        self.check_at = self.searched_at = self.searches = self.most = 0
+        self.checked: tuple[float, Tensor] | None = None  # E and places of the last check
+        self.searched_at = self.searches = self.most = 0
         self.frozen = self.shortened = self.restarts = 0
         self.first_residual = 0.0
 
@@ -185,7 +185,6 @@ class _Run:
         self.contacts = found(self.scene.surfaces, self.current, want, self.keys, self.known)
         self.searches += 1
         self.most = max(self.most, len(self.contacts.pairs))
-        self.checked = None
 
     def _walls(self, positions: Tensor) -> Walls:
         """Planes and spheres of the scene, linearised at positions [N, 3] m and no deeper than these."""
@@ -231,8 +230,8 @@ class _Run:
         near = self.contacts.near(x)
         normals = self.contacts.normals(near)
         omega, self.coming = self.coming, self.schedule.omega(k + 1)
-        if (k - self.check_at) % CHECK == 0:
-            self._check(energy, near, normals)
+        if k % CHECK == 0:
+            self._check(energy, near)
         stepped = self._place(u - self.relaxation * gradient / self.diagonal)
         previous = self.previous[: self.scene.count]
         target = self._by_hand(previous + omega * (stepped - previous))
@@ -247,23 +246,24 @@ class _Run:
         self.keys, self.known = self.contacts.pairs.keys, held
         if touched and k - self.searched_at >= PAUSE and not last:
             self._search(target)
-            self.searched_at, self.check_at = k, k + 1
+            self.searched_at = k
 
-    def _check(self, energy: float, near: Closest, normals: Tensor) -> None:
-        """Restart the momentum where E + psi has risen since the last check of this list."""
+    def _check(self, energy: float, near: Closest) -> None:
+        """Restart the momentum where E + psi has risen since the last check, by the list and multipliers of now."""
         contacts = self.contacts
-        slip = slips(contacts.pairs, near.weights, normals, self.current - self.begin)
 
-        def total(elastic: float, gaps: Tensor, slipped: Tensor) -> float:
-            psi = augmented_lagrangian(contacts.pairs, near.weights, self.inverse, contacts.held, gaps, slipped)
-            return elastic + psi
+        def total(elastic: float, places: Tensor, at: Closest) -> float:
+            slip = slips(contacts.pairs, at.weights, contacts.normals(at), places - self.begin)
+            return elastic + augmented_lagrangian(
+                contacts.pairs, near.weights, self.inverse, contacts.held, at.distance, slip
+            )
 
         if self.checked is not None:
-            before = total(*self.checked)
-            if total(energy, near.distance, slip) > before + self.schedule.tolerance * abs(before):
+            before = total(*self.checked, contacts.near(self.checked[1]))
+            if total(energy, self.current, near) > before + self.schedule.tolerance * abs(before):
                 self.schedule.age = 0
                 self.restarts += 1
-        self.checked = energy, near.distance, slip
+        self.checked = energy, self.current
 
     def _size(self, forces: Array) -> float:
         """sqrt(sum |f|^2 / D) of forces [V, 3] N on what is free."""
