@@ -61,7 +61,7 @@ def far_apart(**options: Any) -> ContactCase:
     """Two cubes that fall side by side, .1 m apart, and quiver."""
     scene = falling(block(0.1, 3), block(0.1, 3, center=(0.2, 0.0, 0.0)))
     velocities = each(scene, (0.0, -30.0, 0.0), (0.0, -30.0, 0.0))
-    velocities = velocities + 0.2 * np.random.default_rng(0).standard_normal(velocities.shape)
+    velocities = velocities + 0.1 * np.random.default_rng(0).standard_normal(velocities.shape)
     return ContactCase(contact_scene(scene, thickness=1e-3, **options), velocities)
 
 

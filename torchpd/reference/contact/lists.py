@@ -12,7 +12,7 @@ from .distance import Closest, closest
 from .limit import Balls, HalfSpaces
 from .planes import Planes, make_planes
 from .prox import Multipliers, directions
-from .search import near_pairs
+from .search import near_pairs, within
 from .surfaces import Pairs, Surfaces
 
 __all__ = ["Contacts", "found"]
@@ -62,14 +62,22 @@ class Contacts:
 def found(surfaces: Surfaces, positions: Tensor, want: Tensor, keys: Tensor, known: Multipliers) -> Contacts:
     """The list of a search at positions [N, 3] m whose vertices want to go to `want` [N, 3] m.
 
-    A ball reaches over what its vertex wants and the thickness, but over no more than a quarter of an edge. Multipliers
+    A ball reaches over what its vertex wants and the thickness. Where less than half of the room to the nearest other
+    side is wanted, it takes that: no pair more comes into the list. It never exceeds a quarter of an edge. Multipliers
     are those `known` of pairs with the same `keys` [n], increasing; 0 for other pairs.
     """
-    reach = 1.2 * (want - positions).norm(dim=1) + surfaces.thickness * ~surfaces.kinematic
-    radii = torch.minimum(reach, 0.25 * surfaces.cell)
+    cap = 0.25 * surfaces.cell
+    pairs = near_pairs(surfaces, positions, cap)
+    near = closest(pairs.corners(positions), pairs.points)
+    radii = torch.minimum(1.2 * (want - positions).norm(dim=1) + surfaces.thickness * ~surfaces.kinematic, cap)
+    room = torch.full_like(cap, torch.inf).scatter_reduce(
+        0, pairs.vertices.reshape(-1), near.distance[:, None].expand(-1, 4).reshape(-1), "amin"
+    )
+    roomy = torch.minimum(0.49 * (room - surfaces.thickness), cap)
+    radii = torch.where(surfaces.kinematic, radii, torch.maximum(radii, roomy))
+    pairs = pairs.chosen(within(pairs, near.distance, radii, surfaces.thickness))
     inside = torch.ones(len(radii), dtype=torch.bool)
     inside[surfaces.vertices] = False
-    pairs = near_pairs(surfaces, positions, radii)
     balls = Balls(positions, torch.where(inside, torch.inf, radii))
     near = closest(pairs.corners(positions), pairs.points)
     planes = make_planes(pairs, positions, want, near)

@@ -9,7 +9,7 @@ from .boxes import overlaps
 from .distance import closest
 from .surfaces import Pairs, Surfaces, joined
 
-__all__ = ["boxed_pairs", "near_pairs"]
+__all__ = ["boxed_pairs", "near_pairs", "within"]
 
 
 def boxed_pairs(surfaces: Surfaces, low: Tensor, high: Tensor, reach: Tensor) -> Pairs:
@@ -32,8 +32,13 @@ def near_pairs(surfaces: Surfaces, positions: Tensor, radii: Tensor) -> Pairs:
     No vertex leaves the ball of its radius. So the sides of every other pair stay r apart, and f.
     """
     pairs = boxed_pairs(surfaces, positions, positions, radii + 0.5 * surfaces.thickness)
+    distance = closest(pairs.corners(positions), pairs.points).distance
+    return pairs.chosen(within(pairs, distance, radii, surfaces.thickness))
+
+
+def within(pairs: Pairs, distance: Tensor, radii: Tensor, thickness: float) -> Tensor:
+    """Whether d <= b_A + b_B + r [m] at distances [m] m, b of a side the largest of its radii [N] m."""
     radius = radii[pairs.vertices]
     on_a = torch.where(pairs.on_a, radius, 0.0).amax(dim=1)
     on_b = torch.where(pairs.on_a, 0.0, radius).amax(dim=1)
-    distance = closest(pairs.corners(positions), pairs.points).distance
-    return pairs.chosen(distance <= on_a + on_b + surfaces.thickness)
+    return distance <= on_a + on_b + thickness

@@ -30,7 +30,7 @@ from ..solvers import guard_tolerance
 from .approach import approach
 from .distance import Closest
 from .hands import Hands
-from .limit import Walls, limit
+from .limit import Walls, into_balls, limit
 from .lists import Contacts, found
 from .prox import Multipliers, augmented_lagrangian, forces, prox, slips
 from .scene import ContactHistory, ContactScene
@@ -101,7 +101,7 @@ def contact_step(
     if observe is not None:
         observe(0, run.current)
     for k in range(iterations):
-        run.iterate(k, last=k + 1 == iterations)
+        run.iterate(k)
         if observe is not None:
             observe(k + 1, run.current)
     return run.result()
@@ -206,8 +206,8 @@ class _Run:
         bound[count:] = -torch.inf
         return Walls(normal, bound)
 
-    def _move(self, target: Tensor) -> bool:
-        """Go as near to `target` [N, 3] m as the promise allows; whether a ball was touched."""
+    def _move(self, target: Tensor) -> None:
+        """Go as near to `target` [N, 3] m as the promise allows."""
         before, contacts = self.current, self.contacts
         stuck, walls = contacts.stuck, self._walls(before)
         free = limit(target, before, contacts.spaces, contacts.balls, walls, stuck, contacts.table)
@@ -219,9 +219,8 @@ class _Run:
         self.previous = torch.where(cut[:, None], self.current, before)
         self.frozen += int((stuck & mobile).sum())
         self.shortened += int(cut.sum())
-        return bool(free.outside.any())
 
-    def iterate(self, k: int, *, last: bool) -> None:
+    def iterate(self, k: int) -> None:
         """x_k to x_{k+1}."""
         x, u = self.current, self._displacement(self.current)
         energy, gradient = self.problem.evaluate(u)
@@ -241,12 +240,14 @@ class _Run:
         )  # fmt: skip
         if len(self.problem.values.planes) or len(self.problem.values.spheres):
             target = self._by_hand(self._place(self.problem.project(self._displacement(target), u)))
-        self.contacts = replace(self.contacts, held=held).refreshed(x, target, near)
-        touched = self._move(target)
         self.keys, self.known = self.contacts.pairs.keys, held
-        if touched and k - self.searched_at >= PAUSE and not last:
+        outside = bool(into_balls(self.contacts.balls, target)[1].any())
+        if outside and (k - self.searched_at >= PAUSE or not bool(held.normal.any())):
             self._search(target)
             self.searched_at = k
+        else:
+            self.contacts = replace(self.contacts, held=held).refreshed(x, target, near)
+        self._move(target)
 
     def _check(self, energy: float, near: Closest) -> None:
         """Restart the momentum where E + psi has risen since the last check, by the list and multipliers of now."""
