@@ -346,8 +346,8 @@ def twisted_strip(
     return ContactCase(made, each(scene, (0.0, 0.0, 0.0)), pins=pins)
 
 
-def folded_cloth(cells: int = 16, *, self_contact: bool = True, **options: Any) -> ContactCase:
-    """A cloth of .4 m on the ground, curled over so that it falls on itself."""
+def folded_cloth(cells: int = 16, *, speed: float = 0.0, self_contact: bool = True, **options: Any) -> ContactCase:
+    """A cloth of .4 m on the ground, curled over so that it falls on itself, its upper part at a speed."""
     radius, flat = 0.03, 0.15
 
     def curled(p: Array) -> Array:
@@ -359,4 +359,5 @@ def folded_cloth(cells: int = 16, *, self_contact: bool = True, **options: Any) 
     scene = falling(cloth, pd.Ground(0.0, friction=0.5))
     values = sprung(scene, (cells, cells), 50.0, 0.05)
     made = contact_scene(scene, thickness=THICKNESS, self_contact=self_contact, values=values, **options)
-    return ContactCase(made, each(scene, (0.0, 0.0, 0.0)))
+    upper = cloth.mesh.vertices[:, 1:2] > 0.004 + radius
+    return ContactCase(made, np.where(upper, [0.0, -speed, 0.0], 0.0))

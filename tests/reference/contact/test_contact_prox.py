@@ -107,7 +107,9 @@ def test_forces_are_those_of_the_fixed_point_for_any_scale() -> None:
     again, other, *_ = solved(x, pairs, target, inverse, 0.7, 20_000)
     assert (again - moved).abs().max() < 1e-8
     assert float(held.normal.sum()) > 0.0
-    assert (0.7 * forces(pairs, weights, normals, other, 6) - 1.9 * forces(pairs, weights, normals, held, 6)).abs().max() < 1e-6
+    assert (
+        0.7 * forces(pairs, weights, normals, other, 6) - 1.9 * forces(pairs, weights, normals, held, 6)
+    ).abs().max() < 1e-6
 
 
 def test_the_augmented_lagrangian_has_the_forces_of_the_multipliers() -> None:

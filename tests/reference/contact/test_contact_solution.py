@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from contact_scenes import H, ContactCase, block, each, falling, free_hit, slope, two_cubes
+from contact_scenes import ContactCase, H, block, each, falling, free_hit, slope, two_cubes
 from programs import ROOT
 
 import torchpd as pd
