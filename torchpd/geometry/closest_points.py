@@ -81,7 +81,7 @@ def segment_distances(first: Array, second: Array) -> Array:
 
 
 def _lengths(vectors: Array) -> Array:
-    return np.asarray(np.linalg.norm(vectors, axis=1))
+    return np.asarray(np.sqrt(np.einsum("pk,pk->p", vectors, vectors)))
 
 
 def _weights(points: Array, corners: Array) -> Array:

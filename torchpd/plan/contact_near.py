@@ -111,6 +111,15 @@ def _boxes(surface: Primitives, touching: Mask, tree: ContactTree, corners: Inde
     return Boxes.of(tree, np.where(out, np.inf, x.min(axis=1) - margin), np.where(out, -np.inf, x.max(axis=1) + margin))
 
 
+def _apart(one: Index, other: Index) -> Mask:
+    """Whether sides [n, a] and [n, b] have no common vertex [n]."""
+    apart = np.ones(len(one), dtype=np.bool_)
+    for corner in one.T:
+        for beside in other.T:
+            apart &= corner != beside
+    return apart
+
+
 def _near_points(surface: Primitives, touching: Mask, margin: float) -> tuple[Index, Index, Array]:
     """Keys, corners [n, 4] and distances [n] m of vertices and triangles of one body whose boxes meet."""
     points, faces = surface.vertices[:, None], surface.triangles
@@ -119,7 +128,7 @@ def _near_points(surface: Primitives, touching: Mask, margin: float) -> tuple[In
         _boxes(surface, touching, surface.triangle_tree, faces, margin),
     )
     corners = np.concatenate([points[row], faces[triangle]], axis=1)
-    keep = (corners[:, 1:] != corners[:, :1]).all(axis=1) & (surface.body[corners[:, 0]] == surface.body[corners[:, 3]])
+    keep = _apart(corners[:, :1], corners[:, 1:]) & (surface.body[corners[:, 0]] == surface.body[corners[:, 3]])
     corners, triangle = corners[keep], triangle[keep]
     distance = triangle_distances(surface.rest[corners[:, 0]], surface.rest[corners[:, 1:]])
     return surface.point_keys(corners[:, 0], triangle), corners, distance
@@ -130,8 +139,7 @@ def _near_edges(surface: Primitives, touching: Mask, margin: float) -> tuple[Ind
     boxes = _boxes(surface, touching, surface.edge_tree, surface.edges, margin)
     first, second = meeting(boxes, boxes)
     corners = np.concatenate([surface.edges[first], surface.edges[second]], axis=1)
-    keep = (corners[:, :2, None] != corners[:, None, 2:]).all(axis=(1, 2))
-    keep &= surface.body[corners[:, 0]] == surface.body[corners[:, 3]]
+    keep = _apart(corners[:, :2], corners[:, 2:]) & (surface.body[corners[:, 0]] == surface.body[corners[:, 3]])
     corners, first, second = corners[keep], first[keep], second[keep]
     distance = segment_distances(surface.rest[corners[:, :2]], surface.rest[corners[:, 2:]])
     return surface.edge_keys(first, second), corners, distance
@@ -142,12 +150,12 @@ def _tied_keys(surface: Primitives, tied: Index) -> Index:
     both = np.concatenate([tied, tied[:, ::-1]])
     row, triangle = _around(surface.triangles, both[:, 1])
     points = both[row, 0]
-    used = np.isin(points, surface.vertices) & (surface.triangles[triangle] != points[:, None]).all(axis=1)
+    used = np.isin(points, surface.vertices) & _apart(points[:, None], surface.triangles[triangle])
     keys = surface.point_keys(points[used], triangle[used])
     row, first = _around(surface.edges, tied[:, 0])
     beside, second = _around(surface.edges, tied[row, 1])
     first = first[beside]
-    used = (surface.edges[first][:, :, None] != surface.edges[second][:, None]).all(axis=(1, 2))
+    used = _apart(surface.edges[first], surface.edges[second])
     return np.unique(np.concatenate([keys, surface.edge_keys(first[used], second[used])]))
 
 

@@ -97,9 +97,9 @@ class Contact(KeyPart):
         self_contact: whether bodies touch themselves, or a list of those that do.
         friction: Coulomb's coefficient, >= 0; or by pairs of bodies, {(cloth, table): 0.3}, where other pairs are as
             without it; or None.
-        thickness: distance at which surfaces rest [m], positive. At most half of the least altitude of a triangle.
-            Parts of one body that rest nearer than twice that keep half of their distance at rest. None: a twentieth
-            of the mean edge of the surface, the least of all bodies.
+        thickness: distance at which surfaces rest [m], positive, at most half of the least altitude of a triangle.
+            Parts of a body that rest nearer than twice that have half of their distance at rest. None: a twentieth of
+            the mean edge, the least of all bodies and colliders.
         capacity: most pairs of a vertex and a triangle, or of two edges, that an environment may have near each other
             in a step. None: 8 per triangle.
 
