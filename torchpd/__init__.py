@@ -13,6 +13,7 @@ from .geometry.tet_mesh import MeshWarning, TetMesh, embed
 from .geometry.tetrahedralize import tetrahedralize
 from .geometry.tri_mesh import TriMesh
 from .scene.cloth import Cloth
+from .scene.contact import Collider, Contact
 from .scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .scene.fibres import Fibres
 from .scene.loads import Pressure, Wind
@@ -50,6 +51,8 @@ __all__ = [
     "CapturedStep",
     "Chebyshev",
     "Cloth",
+    "Collider",
+    "Contact",
     "ContactForces",
     "Damping",
     "Embedding",

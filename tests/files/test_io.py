@@ -145,6 +145,29 @@ def test_bodies_of_every_kind_come_back(tmp_path: Path) -> None:
             np.testing.assert_array_equal(row, second.material[name])
 
 
+def test_contact_comes_back(tmp_path: Path) -> None:
+    """With all its arrays to the bit; contact may come before what it names."""
+    solid, table = pd.Solid(pd.shapes.single_tet(), 1e5), pd.Collider(pd.shapes.box(cells=(1, 1, 1)), friction=0.2)
+    sheet_of, still = pd.Cloth(pd.TriMesh(*sheet()), 1e5, 1e-3, 0.2), {"self_contact": [solid]}
+    other = pd.Collider(table.mesh, pose=(1.0, 2.0, 3.0, 0.3, -0.2, 0.7, 0.1))
+    for number, contact in enumerate(
+        (
+            pd.Contact(friction=0.3, thickness=1e-3, capacity=77, self_contact=False),
+            pd.Contact(sheet_of, other, solid, table, friction={(table, solid): 0.7, (solid, solid): 0.1}, **still),
+            pd.Contact(),
+        )
+    ):
+        sim, path = pd.Simulator(pd.Scene(contact, table, solid, sheet_of, other)), tmp_path / f"{number}"
+        sim.save(path)
+        loaded = load_simulation(path).scene
+        assert [type(part) for part in loaded.parts] == [type(part) for part in sim.scene.parts]
+        one, two = sim.scene.values().contact, loaded.values().contact
+        assert one is not None
+        assert two is not None
+        for field in dataclasses.fields(one):
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(two, field.name), err_msg=field.name)
+
+
 def test_regions_come_back(tmp_path: Path) -> None:
     box = pd.shapes.box((1.0, 1.0, 1.0), (1, 1, 1))
     mesh = pd.TetMesh(box.vertices, box.tets, regions=[1, 1, 2, 2, 3, 3])

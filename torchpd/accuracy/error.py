@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,6 +27,7 @@ from ..common.tables import PLANES, SPHERES
 from ..ops.diagonal import named_material
 from ..plan.material import MATERIAL_ROWS
 from ..reference.problem import StepProblem, step_problem
+from ..scene.contact import Collider, Contact
 from ..scene.effects import Ground, Sphere
 from ..scene.scene import Part, Scene
 from ..scene.solvers import Chebyshev, Multilevel, Solver
@@ -129,15 +130,20 @@ class ExactStep:
 
 
 def scene_without_friction(scene: Scene) -> Scene:
-    """The same parts, with frictionless planes and spheres."""
+    """The same parts, with frictionless planes, spheres, colliders and contact."""
+    twins: dict[int, Any] = {id(part): Collider(part.mesh, pose=part.pose) for part in scene.colliders}
     parts: list[Part] = []
     for part in scene.parts:
         if isinstance(part, Ground):
             parts.append(Ground(part.height, part.normal))
         elif isinstance(part, Sphere):
             parts.append(Sphere(part.center, part.radius))
+        elif isinstance(part, Contact):
+            bodies = [twins.get(id(body), body) for body in part.bodies]
+            options: dict[str, Any] = {"thickness": part.thickness, "capacity": part.capacity}
+            parts.append(Contact(*bodies, self_contact=part.self_contact, **options))
         else:
-            parts.append(part)
+            parts.append(twins.get(id(part), part))
     return Scene(*parts)
 
 

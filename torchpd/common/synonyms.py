@@ -28,7 +28,8 @@ SYNONYMS: dict[str, dict[str, str]] = {
         "Spring": "`Springs(body, pairs, stiffness)` joins pairs of vertices",
         "Attach Sew Weld": "`Tie(body, vertices, other, stiffness=...)` holds vertices to points of another body",
         "Fiber Fibers Fibre Muscle Muscles": "muscles are `Fibres(solid, direction, stiffness)`",
-        "Collider": "bodies collide with `Ground` and `Sphere`",
+        "Collision Collisions SelfCollision": "bodies touch each other and themselves by `Contact()`",
+        "Obstacle RigidBody StaticMesh": "a rigid surface is `Collider(mesh)`",
         "Engine Env Environment Model Sim World": "`Simulator(scene)` steps a `Scene`",
         "Anchor Attachment Constraint Fixed FixedConstraint": "`Pin(solid, vertices)` holds vertices",
         "Floor GroundPlane HalfSpace Plane": "a plane is `Ground(height, normal, friction=...)`",
@@ -80,6 +81,17 @@ SYNONYMS: dict[str, dict[str, str]] = {
         "up": "`normal` points to the free side",
     },
     "Sphere": {"centre pos position": "the middle is `center` [3] in m", "r": "`radius` is in m", "mu": _FRICTION},
+    "Collider": {
+        "position rotation transform": "`pose` is (x, y, z, qw, qx, qy, qz)",
+        "surface triangles vertices": "the surface is `mesh`, a TriMesh(vertices, triangles)",
+        "mu": _FRICTION,
+    },
+    "Contact": {
+        "gap margin offset r radius": "surfaces rest `thickness` apart [m]",
+        "self_collision self_collisions": "whether bodies touch themselves is `self_contact`",
+        "max_contacts": "`capacity` is the most pairs of an environment",
+        "mu": _FRICTION,
+    },
     "Pressure": {
         "p p0 pressure": "the overpressure is `pascals`",
         "cloth solid": "what it pushes is `body`",

@@ -27,6 +27,7 @@ from ..geometry.mesh_checks import set_frozen
 from ..geometry.tet_mesh import TetMesh, without_face_checks
 from ..geometry.tri_mesh import TriMesh
 from ..scene.cloth import Cloth
+from ..scene.contact import Collider, Contact
 from ..scene.effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from ..scene.fibres import Fibres
 from ..scene.loads import Pressure, Wind
@@ -48,7 +49,9 @@ _FIRST_ARRAYS = (
     "stiffness", "masses", "gravity", "damping", "pin_stiffness", "pin_targets", "planes", "spheres",
 )  # fmt: skip
 _KEY = "torchpd"  # of the metadata; others may add their own keys
-_PARTS = (Solid, Cloth, Rod, Springs, Tie, Fibres, Pin, Pressure, Wind, Gravity, Ground, Sphere, Damping)
+_PARTS = (
+    Solid, Cloth, Rod, Springs, Tie, Fibres, Pin, Pressure, Wind, Gravity, Ground, Sphere, Damping, Collider, Contact,
+)  # fmt: skip
 _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in _PARTS}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
 _BODIES = {"body", "other", "solid"}  # fields that hold a body of the scene
@@ -172,16 +175,23 @@ def _part_arrays(part: Part) -> dict[str, NDArray[Any]]:
 
 
 def _part_record(part: Part, scene: Scene, meshes: list[TetMesh]) -> Record:
-    """The fields of a part that are no arrays: numbers and None as they are, bodies and meshes by number."""
+    """The fields of a part that are no arrays: numbers and None as they are, other parts and meshes by number."""
+
+    def number_of(part: Any) -> int:
+        return next(number for number, other in enumerate(scene.parts) if other is part)
+
     record: Record = {"kind": next(name for name, kind in _KINDS.items() if isinstance(part, kind))}
     for name, value in _fields(part).items():
         if isinstance(value, TetMesh):
             record[name] = next(number for number, mesh in enumerate(meshes) if mesh is value)
         elif isinstance(value, Body):
-            number = next(number for number, other in enumerate(scene.parts) if other is value)
-            record["solid" if isinstance(part, Pin) else name] = number
+            record["solid" if isinstance(part, Pin) else name] = number_of(value)
         elif isinstance(part, Pin) and name == "stiffness":
             record["hard"] = value is None
+        elif isinstance(value, tuple):
+            record[name] = [number_of(one) for one in value]
+        elif isinstance(value, Mapping):
+            record[name] = [[number_of(one), number_of(other), item] for (one, other), item in value.items()]
         elif value is None or isinstance(value, bool | int | float | str):
             record[name] = value
     return record
@@ -305,11 +315,11 @@ def _surface(prefix: str, tensors: _Tensors) -> TriMesh:
 
 
 def _parts(records: list[Record], meshes: list[TetMesh], tensors: _Tensors) -> list[Part]:
-    """The parts in their order; a pin or a spring may come before its body."""
+    """The parts in their order; a pin, a spring or contact may come before its body."""
     parts: dict[int, Part] = {}
     for bodies in (True, False):
         for number, record in enumerate(records):
-            if issubclass(_KINDS[record["kind"]], Body) == bodies:
+            if issubclass(_KINDS[record["kind"]], Body | Collider) == bodies:
                 parts[number] = _part(number, record, meshes, parts, tensors)
     return [parts[number] for number in range(len(records))]
 
@@ -317,6 +327,8 @@ def _parts(records: list[Record], meshes: list[TetMesh], tensors: _Tensors) -> l
 def _part(number: int, record: Record, meshes: list[TetMesh], parts: Mapping[int, Part], tensors: _Tensors) -> Part:
     kind = _KINDS[record["kind"]]
     fields = {name: value for name, value in record.items() if name not in ("kind", "hard")}
+    if kind is Contact:
+        return _contact(fields, parts)
     if kind is Solid:
         fields["mesh"] = meshes[record["mesh"]]
     if kind is Pin:
@@ -339,3 +351,13 @@ def _part(number: int, record: Record, meshes: list[TetMesh], parts: Mapping[int
         # normalising again might change the last bit
         set_frozen(part, normal=fields["normal"])
     return part
+
+
+def _contact(fields: Record, parts: Mapping[int, Part]) -> Part:
+    bodies: list[Any] = [parts[number] for number in fields.pop("bodies")]
+    for name, value in fields.items():
+        if isinstance(value, list):
+            fields[name] = [parts[number] for number in value] if name == "self_contact" else {
+                (parts[one], parts[other]): item for one, other, item in value
+            }  # fmt: skip
+    return Contact(*bodies, **fields)

@@ -129,6 +129,9 @@ def _effect_lines(sim: Stepper) -> list[str]:
         lines.append(f"grounds: {len(scene.grounds)}, one projection per vertex and iteration each")
     if scene.spheres:
         lines.append(f"spheres: {len(scene.spheres)}, one projection per vertex and iteration each")
+    if (contact := scene.contact_values) is not None:
+        rigid, taking = len(contact.poses), len(np.unique(contact.body[contact.triangles[:, 0]]))
+        lines.append(f"contact: {taking - rigid} bodies, {rigid} colliders ({len(contact.triangles)} triangles)")
     return lines
 
 

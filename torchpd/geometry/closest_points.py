@@ -1,4 +1,4 @@
-"""Closest points of segments, triangles and tetrahedra, as fixed combinations of their corners."""
+"""Closest points of segments, triangles and tetrahedra, as fixed combinations of their corners; distances of pairs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-__all__ = ["Closest", "closest_points"]
+__all__ = ["Closest", "closest_points", "segment_distances", "triangle_distances"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -52,6 +52,36 @@ def closest_points(points: Array, vertices: Array, elements: Index) -> Closest:
     order = np.lexsort((element, distance, point))
     best = order[np.unique(point[order], return_index=True)[1]]
     return Closest(element[best], weights[best], distance[best])
+
+
+def triangle_distances(points: Array, corners: Array) -> Array:
+    """Distances [P] m of points from one triangle each [P, 3, 3]."""
+    arms = corners - points[:, None]
+    return _lengths(np.einsum("pa,pak->pk", _on_triangles(points, corners), arms))
+
+
+def segment_distances(first: Array, second: Array) -> Array:
+    """Distances [P] m between two segments each [P, 2, 3].
+
+    The least of the four ends from the other segment, and of the lines where their closest points lie inside.
+    """
+    ends = [
+        _lengths(np.einsum("pa,pak->pk", _on_segments(one[:, end], other), other - one[:, end, None]))
+        for one, other in ((first, second), (second, first))
+        for end in (0, 1)
+    ]
+    u, v, w = first[:, 1] - first[:, 0], second[:, 1] - second[:, 0], first[:, 0] - second[:, 0]
+    a, b, c, d, e = (np.einsum("pk,pk->p", *pair) for pair in ((u, u), (u, v), (v, v), (u, w), (v, w)))
+    determinant = a * c - b * b
+    safe = np.where(determinant > 0.0, determinant, 1.0)
+    s, t = (b * e - c * d) / safe, (a * e - b * d) / safe
+    inside = (determinant > 0.0) & (s >= 0.0) & (s <= 1.0) & (t >= 0.0) & (t <= 1.0)
+    between = _lengths(w + s[:, None] * u - t[:, None] * v)
+    return np.asarray(np.minimum(np.min(ends, axis=0), np.where(inside, between, np.inf)))
+
+
+def _lengths(vectors: Array) -> Array:
+    return np.asarray(np.sqrt(np.einsum("pk,pk->p", vectors, vectors)))
 
 
 def _weights(points: Array, corners: Array) -> Array:

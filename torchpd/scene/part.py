@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import FrozenInstanceError
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -88,6 +88,7 @@ class Body(KeyPart, ABC):
     """A part with vertices: a body has a `mesh` with `vertices` [V, 3] m, its rest shape."""
 
     mesh: Any
+    has_triangles: ClassVar[bool] = False  # whether its surface is the triangles of its mesh, which `Contact` takes
 
     @property
     @abstractmethod

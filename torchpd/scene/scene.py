@@ -14,6 +14,7 @@ from ..common.synonyms import check_arguments
 from ..geometry.mesh_faces import mesh_components
 from .averaging import check_signs
 from .cloth import Cloth
+from .contact import Collider, Contact, ContactValues, contact_values
 from .effects import Damping, Gravity, Ground, Pin, Solid, Sphere
 from .fibres import Fibres
 from .loads import Pressure, Wind
@@ -26,7 +27,10 @@ from .tie import Tie
 
 __all__ = ["Part", "Scene", "SceneValues"]
 
-Part = Solid | Cloth | Rod | Springs | Tie | Fibres | Pin | Pressure | Wind | Gravity | Ground | Sphere | Damping
+Part = (
+    Solid | Cloth | Rod | Springs | Tie | Fibres | Pin | Pressure | Wind | Gravity | Ground | Sphere | Damping
+    | Contact | Collider
+)  # fmt: skip
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
@@ -56,6 +60,7 @@ class SceneValues:
     stiffness_damping: Array | None = None  # [E] s, None where no solid has any
     pressure: Array | None = None  # [pressures] Pa, None without any
     wind: Array | None = None  # [3] m/s, None without
+    contact: ContactValues | None = None  # None without `Contact`
 
     @cached_property
     def solid(self) -> NDArray[np.bool_]:
@@ -91,13 +96,15 @@ def _joined(component: Index, stencils: Iterable[StencilGroup]) -> Index:
 class Scene:
     """Bodies and effects, in any order; `Simulator` compiles them.
 
-    Bodies share gravity, grounds and spheres, but pass through each other and themselves. A `Simulator` gives a
-    `SceneWarning` if they overlap at rest, and once if they overlap after a step with `return_info=True`.
+    Bodies share gravity, grounds and spheres, but pass through each other and themselves without `Contact`. A
+    `Simulator` gives a `SceneWarning` if they overlap at rest, and once if they overlap after a step with
+    `return_info=True`.
 
     Args:
         parts: bodies (`Solid`, `Cloth`, `Rod`), what acts on them (`Pin`, `Springs`, `Tie`, `Fibres`, `Pressure`), and
-            `Gravity`, `Wind`, `Ground`, `Sphere`, `Damping`. At least one body; at most one `Gravity`, one `Wind` and
-            one `Damping`. A part acts on bodies of this scene; no vertex is pinned twice.
+            `Gravity`, `Wind`, `Ground`, `Sphere`, `Damping`, `Contact` with its `Collider`s. At least one body; at most
+            one `Gravity`, `Wind`, `Damping` and `Contact`. A part acts on bodies of this scene; no vertex is pinned
+            twice.
     """
 
     @check_arguments("Scene")
@@ -111,19 +118,32 @@ class Scene:
         if len({id(part) for part in parts}) != len(parts):
             twice = next(part for number, part in enumerate(parts) if any(part is one for one in parts[:number]))
             raise ValueError(f"Scene: each part must be given once, got the same {type(twice).__name__} twice")
-        for kind in (Gravity, Damping, Wind):
+        for kind in (Gravity, Damping, Wind, Contact):
             if len(self._all(kind)) > 1:
                 raise ValueError(f"Scene takes at most one {kind.__name__}, got {len(self._all(kind))}")
         if self.wind is not None and all(isinstance(body, Rod) for body in self.bodies):
             raise ValueError("Scene: Wind acts on a Cloth or a Solid, got rods alone, which do not feel it")
-        bodies = {id(body) for body in self.bodies}
+        bodies = {id(body) for body in (*self.bodies, *self.colliders)}
         for part in parts:
             if any(id(body) not in bodies for body in part.bodies_used()):
                 words = f"the body of a {type(part).__name__} must be a part of this scene"
                 raise ValueError(f"Scene: {words}, got another one; pass both")
+        self._check_contact()
         numbers, counts = np.unique(self._pinned(), return_counts=True)
         if (counts > 1).any():
             raise ValueError(f"Scene: pins must hold different vertices, got two at {int(numbers[counts.argmax()])}")
+
+    def _check_contact(self) -> None:
+        """Refuse colliders that touch nothing, and bodies that cannot take part in the contact of all."""
+        named = () if self.contact is None else self.contact.bodies
+        if self.contact is not None and not named:
+            self.contact.check_members((*self.bodies, *self.colliders))
+            return
+        outside = sum(all(collider is not one for one in named) for collider in self.colliders)
+        if outside:
+            came = "none" if self.contact is None else f"{outside} that it does not name"
+            fix = "add Contact()" if self.contact is None else "name them too"
+            raise ValueError(f"Scene: a Collider acts by a Contact of this scene, got {came}; {fix}")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Scene:
         """The scene itself, so that a copied simulator knows the same parts."""
@@ -188,6 +208,14 @@ class Scene:
     @property
     def spheres(self) -> tuple[Sphere, ...]:
         return self._all(Sphere)
+
+    @property
+    def contact(self) -> Contact | None:
+        return next(iter(self._all(Contact)), None)
+
+    @property
+    def colliders(self) -> tuple[Collider, ...]:
+        return self._all(Collider)
 
     def vertex_range(self, body: Body) -> slice:
         """Slice of a body's vertices in positions [B, V, 3]."""
@@ -254,6 +282,7 @@ class Scene:
             stiffness_damping=self._stiffness_damping(),
             pressure=np.array([part.pascals for part in self.pressures]) if self.pressures else None,
             wind=None if self.wind is None else self.wind.velocity,
+            contact=self.contact_values,
         )
 
     def _stencils(self, starts: dict[int, int]) -> Iterator[StencilGroup]:
@@ -270,6 +299,11 @@ class Scene:
         masses = np.concatenate([body.masses() for body in self.bodies])
         masses.setflags(write=False)
         return masses
+
+    @cached_property
+    def contact_values(self) -> ContactValues | None:
+        """Flat arrays of contact, None without."""
+        return None if self.contact is None else contact_values(self.contact, self.bodies, self.colliders)
 
     @cached_property
     def _components(self) -> Index:
