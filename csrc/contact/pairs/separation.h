@@ -74,34 +74,49 @@ PD_HD Vec3<T> common_normal(bool edges, const Vec3<T> (&corner)[4], const Vec3<T
   return select(dot(normal, diff) < T(0), -normal, normal);
 }
 
-// The direction of the largest gap among candidates: between the closest points; the same
-// orthogonal to the edges that carry these; the face's or the common normal; the direction at hand,
-// zero for none. The bound of the gap's rounding is 4 eps of the largest |x_a - x_0|_1.
+// Calls visit(unit vector) along a vector that has a length.
+template <class T, class Visit>
+PD_HD void visit_unit(const Vec3<T>& vector, const Visit& visit) {
+  const T length = square_root(dot(vector, vector));
+  if (length > T(0)) visit((T(1) / length) * vector);
+}
+
+// Calls visit(normal) for unit directions that may separate the sides: between the closest points;
+// the same orthogonal to the edges that carry these; the face's or the common normal.
+template <class T, class Visit>
+PD_HD void each_candidate(bool edges, const Vec3<T> (&corner)[4], const Closest<T>& near,
+                          const Visit& visit) {
+  visit_unit(near.diff, visit);
+  visit_unit(squared_diff(edges, corner, near), visit);
+  visit_unit(common_normal(edges, corner, near.diff), visit);
+}
+
+// The bound of the rounding of a gap: 4 eps of the largest |x_a - x_0|_1.
 template <class T>
-PD_HD Separation<T> separate(bool edges, const Vec3<T> (&corner)[4], const Closest<T>& near,
-                             const Vec3<T>& hand) {
-  const T none(0), one(1);
-  Separation<T> best = {{none, none, none}, T(-HUGE_VAL), none};
-  const auto consider = [&](const Vec3<T>& candidate) {
-    const T length = square_root(dot(candidate, candidate));
-    const bool defined = length > none;
-    const Vec3<T> normal = (one / select(defined, length, one)) * candidate;
-    const T gap = gap_along(edges, normal, corner);
-    const bool larger = defined && gap > best.gap;
-    best.normal = select(larger, normal, best.normal);
-    best.gap = select(larger, gap, best.gap);
-  };
-  consider(near.diff);
-  consider(squared_diff(edges, corner, near));
-  consider(common_normal(edges, corner, near.diff));
-  consider(hand);
+PD_HD T gap_bound(const Vec3<T> (&corner)[4]) {
   T reach(0);
   PD_UNROLL
   for (int a = 1; a < 4; ++a) {
     const T own = sum_of_sizes(corner[a] - corner[0]);
     reach = select(own > reach, own, reach);
   }
-  best.bound = T(4) * epsilon<T>() * reach;
+  return T(4) * epsilon<T>() * reach;
+}
+
+// The direction of the largest gap among the candidates and the direction at hand, zero for none.
+template <class T>
+PD_HD Separation<T> separate(bool edges, const Vec3<T> (&corner)[4], const Closest<T>& near,
+                             const Vec3<T>& hand) {
+  const T none(0);
+  Separation<T> best = {{none, none, none}, T(-HUGE_VAL), gap_bound(corner)};
+  const auto consider = [&](const Vec3<T>& normal) {
+    const T gap = gap_along(edges, normal, corner);
+    const bool larger = gap > best.gap;
+    best.normal = select(larger, normal, best.normal);
+    best.gap = select(larger, gap, best.gap);
+  };
+  each_candidate(edges, corner, near, consider);
+  visit_unit(hand, consider);
   return best;
 }
 

@@ -1,8 +1,9 @@
 // The start of a step: whole bodies move first, each by a common share of its way.
 //
-// A body takes the straight way of its velocities, if its parts stay apart all along: for every pair within reach one
-// direction separates both ends of the way, and so all between, since the gap is concave in the share. Else a body without
-// pins takes its rigid motion, an affine map that folds nothing. Planes between bodies bound the share of each.
+// A body takes the straight way of its velocities, if its parts stay apart all along. Else a body without pins takes its
+// rigid motion, an affine map that folds nothing. Colliders take their screws. Parts stay apart along straight ways if one
+// direction separates both ends: the gap along it is concave in the share. First, bodies that may meet go together by one
+// share, so that what moves alike does not hinder itself. Then each goes on alone, by the share that planes allow.
 #pragma once
 #include "cpu/contact/run.h"
 #include "math/svd.h"
@@ -42,8 +43,25 @@ class Approach {
       end_[v] = own_[b] ? run.target()[v] : place[v] + way_[v];
     }
     for (int v = plan_.body_vertices; v < plan_.vertices; ++v) end_[v] = run.goal()[v];
-    find_pairs(run);
-    take_shares(run, walls);
+    start_ = place;
+    for (std::size_t c = 0; c < run.hands().size(); ++c) {
+      Hand<T>& hand = run.hands_to_move()[c];
+      const Screw<T> screw(hand.pose, hand.goal);
+      if (screws_.size() <= c) screws_.push_back(screw);
+      screws_[c] = screw;
+    }
+    together_.assign(plan_.bodies, T(0));
+    alone_.assign(plan_.bodies, T(1));
+    go_together(run, walls);
+    for (int v = 0; v < plan_.vertices; ++v) place[v] = at(run, v, together_[plan_.body[v]]);
+    go_alone(run, walls);
+    for (int b = 0; b < plan_.bodies; ++b)
+      together_[b] = together_[b] + alone_[b] * (T(1) - together_[b]);
+    for (int v = 0; v < plan_.vertices; ++v) place[v] = at(run, v, together_[plan_.body[v]]);
+    for (std::size_t c = 0; c < run.hands().size(); ++c) {
+      Hand<T>& hand = run.hands_to_move()[c];
+      hand.pose = screws_[c].at(together_[plan_.body[hand.begin]]);
+    }
   }
 
  private:
@@ -128,28 +146,57 @@ class Approach {
             most = std::max(most, reach[pair.vertex[a]]);
           }
           if (!(near.distance <= side[0] + side[1] + plan_.thickness)) return;
-          own_[b] = own_[b] && keeps_apart(pair, near, start, end);
+          const Kept kept = direction_of(pair, start, end);
+          const T gap = gap_along(pair.edges, kept.normal, end);
+          own_[b] = !(gap < kept.least) && kept.least > gap_bound(end);
         });
   }
 
-  // Whether one direction separates the sides at both ends, no nearer than before or than the floor.
-  static bool keeps_apart(const ContactPair<T>& pair, const Closest<T>& near, const Vec3<T> (&start)[4],
-                          const Vec3<T> (&end)[4]) {
+  // A direction with the largest gap at both ends, and the gap that must be kept along it: the floor, or the gap at the start
+  // where that is less. If no direction has it at both ends, the one with the largest gap at the start is taken.
+  struct Kept {
+    Vec3<T> normal;
+    T least;
+  };
+  static Kept direction_of(const ContactPair<T>& pair, const Vec3<T> (&start)[4], const Vec3<T> (&end)[4]) {
     const bool edges = pair.edges;
-    const Separation<T> first = separate(edges, start, near, Vec3<T>{}),
-                        last = separate(edges, end, closest_points(edges, end), Vec3<T>{});
-    const T least = std::min(first.gap, pair.floor());
-    for (const Separation<T>& by : {first, last}) {
-      const T before = gap_along(edges, by.normal, start), after = gap_along(edges, by.normal, end);
-      if (before > by.bound && after > by.bound && before >= least && after >= least) return true;
+    const Closest<T> first = closest_points(edges, start), last = closest_points(edges, end);
+    Vec3<T> by_a{T(0), T(0), T(0)}, by_b = by_a, own = by_a, both = by_a;
+    for (int a = 0; a < 4; ++a) {
+      Vec3<T>& side = pair.on_a(a) ? by_a : by_b;
+      side = side + (end[a] - start[a]);
     }
-    return false;
+    const T on_a(edges ? 2 : 1), on_b(edges ? 2 : 3);
+    const Vec3<T> relative = (T(1) / on_a) * by_a - (T(1) / on_b) * by_b;
+    const T square = dot(relative, relative);
+    const T share = dot(first.diff, relative) / (square > T(0) ? square : T(1));
+    T largest = T(-HUGE_VAL), lower = T(-HUGE_VAL);
+    const auto consider = [&](const Vec3<T>& normal) {
+      const T before = gap_along(edges, normal, start), after = gap_along(edges, normal, end);
+      const T smaller = before < after ? before : after;
+      if (before > largest) largest = before, own = normal;
+      if (smaller > lower) lower = smaller, both = normal;
+    };
+    each_candidate(edges, start, first, consider);
+    visit_unit(subtract_product(first.diff, share, relative), consider);
+    each_candidate(edges, end, last, consider);
+    const T least = largest < pair.floor() ? largest : pair.floor();
+    return {lower >= least ? both : own, least};
   }
 
-  // Pairs of different bodies whose boxes, swept over the whole way, meet.
-  void find_pairs(ContactRun<T>& run) {
+  // Places after a share of the ways.
+  Vec3<T> at(ContactRun<T>& run, int v, T share) const {
+    if (v >= plan_.body_vertices)
+      return screws_[plan_.collider[v]].at(share).place(local_point(plan_, v));
+    if (own_[plan_.body[v]] && share >= T(1)) return end_[v];
+    (void)run;
+    return share > T(0) ? multiply_add(share, way_[v], start_[v]) : start_[v];
+  }
+
+  // Pairs of different bodies that may meet on the way from the run's places to the ends.
+  template <class Visit>
+  void each_between(ContactRun<T>& run, const Visit& visit) {
     const Places& place = run.place();
-    list_.pairs.clear();
     run.search().each_boxed(
         [&](int v) {
           Box<T> box{place[v], place[v]};
@@ -164,73 +211,116 @@ class Approach {
         },
         [&](int v) { return run.moves_by_hand(v); },
         [&](ContactPair<T>& pair) {
-          if (plan_.body[pair.vertex[0]] == plan_.body[pair.vertex[3]]) return;
-          Vec3<T> corner[4];
-          pair.corners(place, corner);
-          make_plane(pair, place, end_, closest_points(pair.edges, corner), Vec3<T>{});
-          list_.pairs.push_back(pair);
+          if (plan_.body[pair.vertex[0]] != plan_.body[pair.vertex[3]]) visit(pair);
         });
-    list_.index(plan_.vertices);
+  }
+
+  // Groups of moving bodies that pairs couple: each goes by one share.
+  int group(int body) const {
+    while (group_[body] != body) body = group_[body];
+    return body;
   }
 
   template <class Walls>
-  void take_shares(ContactRun<T>& run, const Walls& walls) {
-    Places& place = run.place();
+  void go_together(ContactRun<T>& run, const Walls& walls) {
+    std::vector<char> moves(plan_.bodies, 0);
+    for (int v = 0; v < plan_.vertices; ++v) {
+      const Vec3<T> way = end_[v] - run.place()[v];
+      if (way.x != T(0) || way.y != T(0) || way.z != T(0)) moves[plan_.body[v]] = 1;
+    }
+    group_.resize(plan_.bodies);
+    for (int b = 0; b < plan_.bodies; ++b) group_[b] = b;
+    list_.pairs.clear();
+    kept_.clear();
+    each_between(run, [&](ContactPair<T>& pair) {
+      Vec3<T> start[4], end[4];
+      pair.corners(run.place(), start);
+      pair.corners(end_, end);
+      kept_.push_back(direction_of(pair, start, end));
+      list_.pairs.push_back(pair);
+      const int a = plan_.body[pair.vertex[0]], b = plan_.body[pair.vertex[3]];
+      if (moves[a] && moves[b]) group_[std::max(group(a), group(b))] = std::min(group(a), group(b));
+    });
+    for (int g = 0; g < plan_.bodies; ++g) {
+      if (group(g) != g || !moves[g]) continue;
+      const T share = largest_share<T>([&](T s) { return goes(run, g, s, walls); });
+      for (int b = 0; b < plan_.bodies; ++b)
+        if (group(b) == g) together_[b] = share;
+    }
+    for (int b = 0; b < plan_.bodies; ++b)
+      if (!moves[b]) together_[b] = T(1);
+  }
+
+  // Whether a group may take a share of its ways, as others stand still.
+  template <class Walls>
+  bool goes(ContactRun<T>& run, int g, T share, const Walls& walls) const {
+    const auto place = [&](int v) { return group(plan_.body[v]) == g ? at(run, v, share) : start_[v]; };
+    for (std::size_t n = 0; n < kept_.size(); ++n) {
+      const ContactPair<T>& pair = list_.pairs[n];
+      if (group(plan_.body[pair.vertex[0]]) != g && group(plan_.body[pair.vertex[3]]) != g) continue;
+      Vec3<T> corner[4];
+      for (int a = 0; a < 4; ++a) corner[a] = place(pair.vertex[a]);
+      const T gap = gap_along(pair.edges, kept_[n].normal, corner);
+      if (gap < kept_[n].least || gap <= gap_bound(corner)) return false;
+    }
     const Ball<T> anywhere{{T(0), T(0), T(0)}, T(HUGE_VAL)};
-    const auto allowed = [&](int v, const Vec3<T>& to, bool by_walls) {
-      const T margin = place_margin(place[v]);
-      return is_allowed(to, anywhere, [&](const auto& visit) {
-        list_.each_space(v, visit);
-        if (by_walls)
-          walls(v, place[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
+    for (int v = 0; v < plan_.body_vertices; ++v) {
+      if (group(plan_.body[v]) != g || own_[plan_.body[v]]) continue;
+      const T margin = place_rounding(start_[v]);
+      const bool fine = is_allowed(place(v), anywhere, [&](const auto& visit) {
+        walls(v, start_[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
       });
-    };
-    Places moved = place;
+      if (!fine) return false;
+    }
+    return true;
+  }
+
+  template <class Walls>
+  void go_alone(ContactRun<T>& run, const Walls& walls) {
+    const Places& place = run.place();
+    list_.pairs.clear();
+    each_between(run, [&](ContactPair<T>& pair) {
+      Vec3<T> corner[4];
+      pair.corners(place, corner);
+      make_plane(pair, place, end_, closest_points(pair.edges, corner), Vec3<T>{});
+      list_.pairs.push_back(pair);
+    });
+    list_.index(plan_.vertices);
+    const Ball<T> anywhere{{T(0), T(0), T(0)}, T(HUGE_VAL)};
     for (int b = 0; b < plan_.bodies; ++b) {
-      if (!(rigid_[b].mass > 0)) continue;
-      const auto at = [&](int v, T share) {
-        return own_[b] && share >= T(1) ? end_[v] : multiply_add(share, way_[v], place[v]);
-      };
-      const T share = share_of(b, 0, plan_.body_vertices, [&](int v, T s) { return allowed(v, at(v, s), !own_[b]); });
-      each_of(b, 0, plan_.body_vertices, [&](int v) { moved[v] = share > T(0) ? at(v, share) : place[v]; });
-    }
-    for (Hand<T>& hand : run.hands_to_move()) {
-      const Screw<T> screw(hand.pose, hand.goal);
+      const T done = together_[b], rest = T(1) - done;
+      if (!(rest > T(0))) continue;
       bool stuck = false;
-      for (int v = hand.begin; v < hand.end; ++v) stuck = stuck || list_.is_stuck(v);
-      const T share = stuck ? T(0) : largest_share<T>([&](T s) {
-        const Pose<T> pose = screw.at(s);
-        for (int v = hand.begin; v < hand.end; ++v)
-          if (!allowed(v, pose.place(local_point(plan_, v)), false)) return false;
-        return true;
+      each_of(b, [&](int v) { stuck = stuck || list_.is_stuck(v); });
+      alone_[b] = stuck ? T(0) : largest_share<T>([&](T s) {
+        bool fine = true;
+        each_of(b, [&](int v) {
+          if (!fine) return;
+          const T margin = place_rounding(place[v]);
+          fine = is_allowed(at(run, v, done + s * rest), anywhere, [&](const auto& visit) {
+            list_.each_space(v, visit);
+            if (!own_[b])
+              walls(v, place[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
+          });
+        });
+        return fine;
       });
-      hand.pose = screw.at(share);
-      for (int v = hand.begin; v < hand.end; ++v) moved[v] = hand.pose.place(local_point(plan_, v));
     }
-    place = moved;
   }
 
   template <class Visit>
-  void each_of(int body, int begin, int end, const Visit& visit) const {
-    for (int v = begin; v < end; ++v)
+  void each_of(int body, const Visit& visit) const {
+    for (int v = 0; v < plan_.vertices; ++v)
       if (plan_.body[v] == body) visit(v);
-  }
-
-  template <class Allowed>
-  T share_of(int body, int begin, int end, const Allowed& allowed) const {
-    bool stuck = false;
-    each_of(body, begin, end, [&](int v) { stuck = stuck || list_.is_stuck(v); });
-    if (stuck) return T(0);
-    return largest_share<T>([&](T s) {
-      bool fine = true;
-      each_of(body, begin, end, [&](int v) { fine = fine && allowed(v, s); });
-      return fine;
-    });
   }
 
   const ContactPlan<T>& plan_;
   PairList<T> list_;
-  Places way_, end_;
+  std::vector<Kept> kept_;        // of the pairs of a group
+  std::vector<Screw<T>> screws_;  // of colliders
+  std::vector<T> together_, alone_;
+  std::vector<int> group_;
+  Places way_, end_, start_;
   std::vector<RigidWay> rigid_;
   std::vector<char> own_, pinned_;
 };

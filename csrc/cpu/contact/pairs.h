@@ -26,9 +26,6 @@ struct ContactPair {
   // at the present iterate
   Closest<T> near = {};
   Vec3<T> normal = {};
-  // when the guard last looked
-  T checked_distance = 0;
-  Vec3<T> checked_slip = {};
 
   T floor() const { return T(floor_share) * thickness; }
   bool on_a(int corner) const { return corner <= (edges ? 1 : 0); }
@@ -113,6 +110,7 @@ class PairSearch {
       const std::int64_t* const end = plan_.rest_key + plan_.rest_pairs;
       const std::int64_t* const at = std::lower_bound(plan_.rest_key, end, pair.key);
       if (at != end && *at == pair.key) pair.thickness = plan_.rest_thickness[at - plan_.rest_key];
+      if (!(pair.thickness > T(0))) return;  // a tie joins the sides
     }
     pair.friction = plan_.friction[std::int64_t(first) * plan_.bodies + last];
     visit(pair);
@@ -129,11 +127,6 @@ struct Wall {
   Vec3<T> normal;
   T bound;
 };
-
-template <class T>
-PD_HD T place_margin(const Vec3<T>& place) {
-  return T(2) * epsilon<T>() * (absolute(place.x) + absolute(place.y) + absolute(place.z));
-}
 
 // The list of the last search, with the entries of every vertex.
 template <class T>

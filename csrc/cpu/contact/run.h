@@ -12,6 +12,7 @@ namespace pd::inline PD_TARGET {
 constexpr int contact_sweeps = 4;   // of multipliers in an iteration
 constexpr int search_pause = 5;     // least iterations between searches
 constexpr double ball_reach = 1.2;  // of what a vertex wants; see ball_cells
+constexpr double ball_room = 0.49;  // of the room to the nearest other side
 constexpr double ball_cells = 0.25;  // most radius of a ball, over the mean edge
 constexpr double least_yield = 1e-6;  // of the weights of a pair, on vertices that move freely
 
@@ -68,38 +69,46 @@ class ContactRun {
     gap = HUGE_VAL;
     most_pairs = searches = shortened = frozen = 0;
     searched_at_ = 0;
-    waits_ = false;
+    waits_ = checked_ = false;
   }
 
-  // Lists the pairs that may come near while no vertex leaves its ball.
+  // Lists the pairs that may come near while no vertex leaves its ball. A ball reaches over what its vertex wants and the
+  // thickness. Where that is less than half of the room to the nearest other side, it takes that: no pair more is listed.
   void find() {
-    for (int v = 0; v < plan_.vertices; ++v) {
-      const Vec3<T> way = target_[v] - place_[v];
-      const T reach = T(ball_reach) * square_root(dot(way, way)) + (held_[v] ? T(0) : plan_.thickness),
-              most = T(ball_cells) * plan_.cell[v];
-      radius(v) = reach < most ? reach : most;
-      balls_[v].center = place_[v];
-    }
-    list_.pairs.clear();
-    std::int64_t count = 0;
+    const auto most = [&](int v) { return T(ball_cells) * plan_.cell[v]; };
+    near_.clear();
+    room_.assign(plan_.vertices, T(HUGE_VAL));
     search_.each_boxed(
         [&](int v) { return Box<T>{place_[v], place_[v]}; },
-        [&](int v) { return radius(v) + T(0.5) * plan_.thickness; },
+        [&](int v) { return most(v) + T(0.5) * plan_.thickness; },
         [&](int v) { return moves_by_hand(v); },
         [&](ContactPair<T>& pair) {
           Vec3<T> corner[4];
           pair.corners(place_, corner);
-          const Closest<T> near = closest_points(pair.edges, corner);
-          if (!(near.distance <= reach_of(pair) + plan_.thickness)) return;
-          if (++count > plan_.capacity) return;
-          make_plane(pair, place_, target_, near, Vec3<T>{});
-          list_.pairs.push_back(pair);
+          pair.near = closest_points(pair.edges, corner);
+          if (!is_within(pair, most)) return;
+          for (int v : pair.vertex) room_[v] = std::min(room_[v], pair.near.distance);
+          near_.push_back(pair);
         });
+    for (int v = 0; v < plan_.vertices; ++v) {
+      const Vec3<T> way = target_[v] - place_[v];
+      const T wanted = T(ball_reach) * square_root(dot(way, way)) + (held_[v] ? T(0) : plan_.thickness);
+      const T roomy = held_[v] ? T(0) : T(ball_room) * (room_[v] - plan_.thickness);
+      radius(v) = std::min(std::max(wanted, roomy), most(v));
+      balls_[v].center = place_[v];
+    }
+    list_.pairs.clear();
+    for (ContactPair<T>& pair : near_) {
+      if (!is_within(pair, [&](int v) { return balls_[v].radius; })) continue;
+      make_plane(pair, place_, target_, pair.near, Vec3<T>{});
+      list_.pairs.push_back(pair);
+    }
     // inside bodies nothing meets
     for (int v = 0; v < plan_.vertices; ++v)
       if (!is_surface_[v]) radius(v) = T(HUGE_VAL);
-    most_pairs = count > most_pairs ? count : most_pairs;
+    most_pairs = std::max(most_pairs, std::int64_t(list_.pairs.size()));
     ++searches;
+    if (overflows()) list_.pairs.clear();
     list_.index(plan_.vertices);
     look();
     for (ContactPair<T>& pair : list_.pairs) {
@@ -108,7 +117,6 @@ class ContactRun {
       if (at == known_.end() || at->key != pair.key) continue;
       pair.force = {at->force.normal, tangential(at->force.tangential, pair.normal)};
     }
-    checked_ = false;
   }
 
   // Closest points and normals of all pairs at the present iterate.
@@ -117,30 +125,32 @@ class ContactRun {
       Vec3<T> corner[4];
       pair.corners(place_, corner);
       pair.near = closest_points(pair.edges, corner);
-      const T d = pair.near.distance;
-      pair.normal = d > T(1e-9) ? (T(1) / d) * pair.near.diff : pair.plane.normal;
+      pair.normal = normal_of(pair, pair.near);
     }
   }
 
-  // E + psi before and now, both by the multipliers of now; the energies are those of the bodies alone.
+  // E + psi at the last check and now, both by the list and the multipliers of now.
   struct Merits {
     double before, now;
     bool known;
   };
   Merits check(double energy) {
-    Merits merits{last_energy_, energy, checked_};
-    for (ContactPair<T>& pair : list_.pairs) {
+    Merits merits{checked_energy_, energy, checked_};
+    for (const ContactPair<T>& pair : list_.pairs) {
       const T yielding = yield_of(pair);
-      const Vec3<T> slip = slip_of(pair);
-      const auto psi = [&](T distance, const Vec3<T>& slipped) {
-        return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction, distance, slipped);
+      const auto psi = [&](const Places& places, const Closest<T>& at) {
+        return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction, at.distance,
+                                    slip_of(pair, places, at));
       };
-      if (checked_) merits.before += psi(pair.checked_distance, pair.checked_slip);
-      merits.now += psi(pair.near.distance, slip);
-      pair.checked_distance = pair.near.distance;
-      pair.checked_slip = slip;
+      if (checked_) {
+        Vec3<T> corner[4];
+        pair.corners(checked_place_, corner);
+        merits.before += psi(checked_place_, closest_points(pair.edges, corner));
+      }
+      merits.now += psi(place_, pair.near);
     }
-    last_energy_ = energy;
+    checked_energy_ = energy;
+    checked_place_ = place_;
     checked_ = true;
     return merits;
   }
@@ -190,9 +200,8 @@ class ContactRun {
   // Goes as near to the targets as the promise allows. `walls(vertex, visit)`: half-spaces of the scene.
   template <class Walls>
   void move(const Walls& walls) {
-    refresh();
     cut_.assign(plan_.vertices, 0);
-    touched_ = cut_any_ = false;
+    cut_any_ = false;
     shift_ = place_;
     for (int v = 0; v < plan_.vertices; ++v) {
       if (held_[v]) continue;
@@ -204,19 +213,27 @@ class ContactRun {
       const LimitedPlace<T> to =
           limit(target_[v], place_[v], balls_[v], [&](const auto& visit) { each_space(v, walls, visit); });
       shift_[v] = to.place;
-      touched_ = touched_ || to.outside;
       if (to.shortened) cut(v);
     }
     move_hands(walls);
     std::swap(place_, shift_);
   }
 
-  // Whether a search is due after iteration k; it also says whether it waits for the pause.
-  bool asks_for_search(int k) {
-    waits_ = touched_;
-    if (!touched_ || k - searched_at_ < search_pause) return false;
+  // Before the move of iteration k: a search if a vertex wants to leave its ball, else planes that targets violate are made
+  // anew at the present iterate. Searches pause while pairs have forces.
+  void prepare(int k) {
+    remember();
+    bool outside = false, loaded = false;
+    for (int v = 0; v < plan_.vertices && !outside; ++v) {
+      Vec3<T> target = target_[v];
+      outside = move_into(balls_[v], target);
+    }
+    for (const ContactPair<T>& pair : list_.pairs) loaded = loaded || pair.force.normal != T(0);
+    const bool due = k - searched_at_ >= search_pause || !loaded;
+    waits_ = outside && !due;
+    if (!outside || !due) return refresh();
     searched_at_ = k;
-    return true;
+    find();
   }
 
   // Forces of all pairs are known to the next search.
@@ -295,15 +312,6 @@ class ContactRun {
 
   T& radius(int v) { return balls_[v].radius; }
 
-  T reach_of(const ContactPair<T>& pair) const {
-    T reach[2] = {T(0), T(0)};
-    for (int a = 0; a < 4; ++a) {
-      T& side = reach[pair.on_a(a) ? 0 : 1];
-      side = std::max(side, balls_[pair.vertex[a]].radius);
-    }
-    return reach[0] + reach[1];
-  }
-
   T yield_of(const ContactPair<T>& pair) const {
     T sum(0);
     for (int a = 0; a < 4; ++a)
@@ -318,10 +326,25 @@ class ContactRun {
     return sum;
   }
 
-  Vec3<T> slip_of(const ContactPair<T>& pair) const {
+  Vec3<T> slip_of(const ContactPair<T>& pair, const Places& places, const Closest<T>& at) const {
     Vec3<T> moved[4];
-    for (int a = 0; a < 4; ++a) moved[a] = place_[pair.vertex[a]] - begin_[pair.vertex[a]];
-    return tangential(combined(pair.near.weight, moved), pair.normal);
+    for (int a = 0; a < 4; ++a) moved[a] = places[pair.vertex[a]] - begin_[pair.vertex[a]];
+    return tangential(combined(at.weight, moved), normal_of(pair, at));
+  }
+
+  static Vec3<T> normal_of(const ContactPair<T>& pair, const Closest<T>& at) {
+    return at.distance > T(1e-9) ? (T(1) / at.distance) * at.diff : pair.plane.normal;
+  }
+
+  // Whether d <= b_A + b_B + r, with b of a side the largest of its vertices.
+  template <class Radius>
+  bool is_within(const ContactPair<T>& pair, const Radius& radius) const {
+    T reach[2] = {T(0), T(0)};
+    for (int a = 0; a < 4; ++a) {
+      T& side = reach[pair.on_a(a) ? 0 : 1];
+      side = std::max(side, T(radius(pair.vertex[a])));
+    }
+    return pair.near.distance <= reach[0] + reach[1] + plan_.thickness;
   }
 
   // targets, shifted by the forces of active pairs
@@ -353,7 +376,7 @@ class ContactRun {
   template <class Walls, class Visit>
   void each_space(int v, const Walls& walls, const Visit& visit) const {
     list_.each_space(v, visit);
-    const T margin = place_margin(place_[v]);
+    const T margin = place_rounding(place_[v]);
     walls(v, place_[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
   }
 
@@ -406,8 +429,11 @@ class ContactRun {
   std::vector<Ball<T>> balls_;
   std::vector<Known> known_;
   std::vector<int> active_;
-  double last_energy_ = 0;
-  bool checked_ = false, touched_ = false, cut_any_ = false, waits_ = false;
+  std::vector<ContactPair<T>> near_;  // of a search, before balls are known
+  std::vector<T> room_;               // to the nearest other side
+  Places checked_place_;
+  double checked_energy_ = 0;
+  bool checked_ = false, cut_any_ = false, waits_ = false;
   int searched_at_ = 0;
 };
 

@@ -64,38 +64,34 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
       run_.find();
       go();
       for (int i = 0; i < plan_.vertices; ++i) w_.before[i] = w_.u[i];
-      check_at_ = 0;
       return;
     }
     if (plan_.components == 0) return;
     correct([&](const auto& visit) { run_.each_listed(visit); });
     want([&](int i) { return w_.u[i]; });
+    run_.prepare(set_.iterations);
     go();
   }
 
   void iterate(int k) {
     const T omega(next_omega_[0]);
-    const bool guards = schedule_[0].kind == ScheduleKind::guarded && (k - check_at_) % guard_period == 0;
+    const bool guards = schedule_[0].checks_energy(k);
     run_.look();
     sweep_.run(k & 1, elastic_gradient<true>(), [&](std::int64_t i, const Value& force, Sum& sums) {
       const auto v = vertex(i);
       sums.energy = v.add_energy(w_.u[i], sums.energy);
-      free_[i] = accelerate(w_.u[i], w_.before[i], v.gradient(w_.u[i], force),
-                            theta_ * w_.inverse[i], omega);
+      free_[i] = Lanes::vec3(accelerate(w_.u[i], w_.before[i], v.gradient(w_.u[i], force),
+                                        theta_ * w_.inverse[i], omega));
     });
     ++used_[0];
     next_omega_[0] = schedule_[0].next(k + 1);
     if (guards) guard(double(this->total(k & 1).energy));
-    want([&](int i) { return free_[i]; });
+    want([&](int i) { return Lanes::value(free_[i]); });
     run_.prox(theta_ * omega);
     if constexpr (HasContacts) leave_walls();
+    run_.prepare(k);
     const double change = go();
     if (set_.tolerance > 0) stop(change, omega);
-    if (k + 1 < set_.iterations && run_.asks_for_search(k)) {
-      run_.remember();
-      run_.find();
-      check_at_ = k + 1;
-    }
   }
 
  private:
@@ -117,7 +113,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   // The coarse correction of components without a vertex of each_touching(visit).
   template <class Each>
   void correct(const Each& each_touching) {
-    for (int i = 0; i < plan_.vertices; ++i) free_[i] = w_.u[i];
+    for (int i = 0; i < plan_.vertices; ++i) free_[i] = Lanes::vec3(w_.u[i]);
     Base::align();
     std::fill(touches_.begin(), touches_.end(), 0);
     each_touching([&](int v) {
@@ -126,7 +122,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     });
     for (int i = 0; i < plan_.vertices; ++i) {
       const int g = plan_.vertex_component[i];
-      if (g >= 0 && touches_[g]) w_.u[i] = free_[i];
+      if (g >= 0 && touches_[g]) w_.u[i] = Lanes::value(free_[i]);
     }
   }
 
@@ -240,10 +236,10 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   ContactRun<T>& run_;
   Approach<T>& approach_;
   std::int64_t environment_;
-  std::vector<Value> free_ = std::vector<Value>(plan_.vertices);  // the next iterate before contact
+  // displacements of the next iterate before contact; a Quad is aligned more than std::vector grants
+  std::vector<Vec3<T>> free_ = std::vector<Vec3<T>>(plan_.vertices);
   std::vector<int> inside_;        // internal number of the user's vertices
   std::vector<char> touches_;      // [components]
-  int check_at_ = 0;
   bool begun_ = false;
 };
 

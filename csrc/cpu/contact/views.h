@@ -1,7 +1,5 @@
 // What contact between bodies reads and writes: surfaces of all bodies in one array of vertices, colliders last.
 #pragma once
-#include "math/config.h"
-
 #include <cstdint>
 
 namespace pd {
