@@ -30,7 +30,7 @@ from torchpd.reference.contact.search import near_pairs
 
 @pytest.mark.parametrize(
     ("case", "steps"),
-    [(two_cubes(), 12), (free_hit(), 8), (needle(), 8), (fixed_edge(), 8)],
+    [(two_cubes(), 12), (free_hit(2, 10.0), 4), (needle(), 8), (fixed_edge(), 8)],
     ids=["two cubes", "free hit", "needle", "edge"],
 )
 @pytest.mark.parametrize("iterations", [2, 16])
@@ -69,7 +69,7 @@ def test_a_ball_on_a_sheet(speed: float, iterations: int) -> None:
     assert any(float(result.contacts.held.normal.sum()) > 0.0 for result in run.steps)
 
 
-def test_without_planes_the_ball_crosses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_planes_cubes_cross(monkeypatch: pytest.MonkeyPatch) -> None:
     """A control: half-spaces that hold everything."""
 
     def nowhere(*args: Any) -> Planes:
@@ -78,10 +78,10 @@ def test_without_planes_the_ball_crosses(monkeypatch: pytest.MonkeyPatch) -> Non
         return replace(made, above=-far, below=far, frozen=torch.zeros_like(made.frozen))
 
     monkeypatch.setattr(lists, "make_planes", nowhere)
-    assert watched(ball_on_sheet(), 4, 16).crossed > 0
+    assert watched(free_hit(2, 10.0), 4, 8).crossed > 0
 
 
-def test_without_balls_the_ball_crosses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_balls_cubes_cross(monkeypatch: pytest.MonkeyPatch) -> None:
     """A control: pairs that no search has found do not hinder."""
 
     def anywhere(_: limit.Balls, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -89,7 +89,7 @@ def test_without_balls_the_ball_crosses(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(limit, "into_balls", anywhere)
     monkeypatch.setattr(step, "into_balls", anywhere)
-    assert watched(ball_on_sheet(), 4, 16).crossed > 0
+    assert watched(free_hit(2, 10.0), 4, 8).crossed > 0
 
 
 def test_without_the_share_of_colliders_plates_cross(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,7 +33,7 @@ class Balls:
     """The balls of the vertices, around their places at the last search."""
 
     centers: Tensor  # [N, 3] m
-    radii: Tensor  # [N] m, inf for bodies without a surface
+    radii: Tensor  # [N] m, inf for vertices inside bodies
 
 
 @dataclass(frozen=True)

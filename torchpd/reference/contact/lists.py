@@ -76,7 +76,9 @@ def found(surfaces: Surfaces, positions: Tensor, want: Tensor, keys: Tensor, kno
     roomy = torch.minimum(0.49 * (room - surfaces.thickness), cap)
     radii = torch.where(surfaces.kinematic, radii, torch.maximum(radii, roomy))
     pairs = pairs.chosen(within(pairs, near.distance, radii, surfaces.thickness))
-    balls = Balls(positions, torch.where(cap > 0.0, radii, torch.inf))
+    inside = torch.ones(len(radii), dtype=torch.bool)
+    inside[surfaces.vertices] = False
+    balls = Balls(positions, torch.where(inside, torch.inf, radii))
     near = closest(pairs.corners(positions), pairs.points)
     planes = make_planes(pairs, positions, want, near)
     held = _warm(pairs, directions(near, planes.normals), keys, known)
