@@ -166,3 +166,18 @@ def test_a_cloth_that_folds_on_itself(self_contact: bool) -> None:
         assert len(crossings(whole, x)) == 0 or not self_contact
         assert x.isfinite().all()
     assert (gap >= 0.099) == self_contact
+
+
+@pytest.mark.parametrize("case", [free_hit(2, 10.0), ball_on_sheet(8, 20.0, 2), plates(0.0, 0.1, 2)])
+def test_straight_ways_between_iterates(case: ContactCase) -> None:
+    """The set is convex: places between two iterates are free of crossings, too."""
+    last: list[torch.Tensor] = []
+
+    def observe(k: int, places: torch.Tensor) -> None:
+        for share in (0.25, 0.5, 0.75) if k else ():
+            assert len(crossings(case.scene.surfaces, torch.lerp(last[-1], places, share))) == 0
+        last.append(places)
+
+    for _ in case.steps(6, 8, observe=observe):
+        pass
+    assert len(last) == 54
