@@ -30,7 +30,7 @@ from torchpd.reference.contact.search import near_pairs
 
 @pytest.mark.parametrize(
     ("case", "steps"),
-    [(two_cubes(), 12), (free_hit(), 8), (needle(), 8), (fixed_edge(), 8)],
+    [(two_cubes(), 12), (free_hit(2, 10.0), 4), (needle(), 8), (fixed_edge(), 8)],
     ids=["two cubes", "free hit", "needle", "edge"],
 )
 @pytest.mark.parametrize("iterations", [2, 16])
@@ -69,7 +69,7 @@ def test_a_ball_on_a_sheet(speed: float, iterations: int) -> None:
     assert any(float(result.contacts.held.normal.sum()) > 0.0 for result in run.steps)
 
 
-def test_without_planes_the_ball_crosses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_planes_cubes_cross(monkeypatch: pytest.MonkeyPatch) -> None:
     """A control: half-spaces that hold everything."""
 
     def nowhere(*args: Any) -> Planes:
@@ -78,10 +78,10 @@ def test_without_planes_the_ball_crosses(monkeypatch: pytest.MonkeyPatch) -> Non
         return replace(made, above=-far, below=far, frozen=torch.zeros_like(made.frozen))
 
     monkeypatch.setattr(lists, "make_planes", nowhere)
-    assert watched(ball_on_sheet(), 4, 16).crossed > 0
+    assert watched(free_hit(2, 10.0), 4, 8).crossed > 0
 
 
-def test_without_balls_the_ball_crosses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_balls_cubes_cross(monkeypatch: pytest.MonkeyPatch) -> None:
     """A control: pairs that no search has found do not hinder."""
 
     def anywhere(_: limit.Balls, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -89,7 +89,7 @@ def test_without_balls_the_ball_crosses(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(limit, "into_balls", anywhere)
     monkeypatch.setattr(step, "into_balls", anywhere)
-    assert watched(ball_on_sheet(), 4, 16).crossed > 0
+    assert watched(free_hit(2, 10.0), 4, 8).crossed > 0
 
 
 def test_without_the_share_of_colliders_plates_cross(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,3 +166,18 @@ def test_a_cloth_that_folds_on_itself(self_contact: bool) -> None:
         assert len(crossings(whole, x)) == 0 or not self_contact
         assert x.isfinite().all()
     assert (gap >= 0.099) == self_contact
+
+
+@pytest.mark.parametrize("case", [free_hit(2, 10.0), ball_on_sheet(8, 20.0, 2), plates(0.0, 0.1, 2)])
+def test_straight_ways_between_iterates(case: ContactCase) -> None:
+    """The set is convex: places between two iterates are free of crossings, too."""
+    last: list[torch.Tensor] = []
+
+    def observe(k: int, places: torch.Tensor) -> None:
+        for share in (0.25, 0.5, 0.75) if k else ():
+            assert len(crossings(case.scene.surfaces, torch.lerp(last[-1], places, share))) == 0
+        last.append(places)
+
+    for _ in case.steps(6, 8, observe=observe):
+        pass
+    assert len(last) == 54

@@ -1,15 +1,15 @@
 """One step of bodies in contact: guarded Chebyshev, contact as one more prox, and the promise of no crossing.
 
-    approach, search, x_0 = limit(x_t + h v)
+    approach: whole bodies to x_t + h v, or as far as they come; search; x_0
     x' = x_{k-1} + omega (x_k - theta g / D - x_{k-1})            as without contact: D knows nothing of it
     x' = prox of the pairs, then planes and spheres of the scene; what moves by hand goes to its target
     x_{k+1} = limit(x')        planes of pairs that x' violates are made anew at x_k before
-    search again where a ball was touched, at the earliest five iterations after the last search
+    a search at x_k precedes where x' leaves a ball; while any pair has a force, five iterations after the last one
 
 Every iterate, and every straight way between two of them, is free of crossings, however few the iterations. Every
-fourth iteration the guard compares E + psi, with psi the augmented Lagrangian by the multipliers of now on both sides.
-A coarse correction of bodies in contact will come after the guard, before the prox, every fourth iteration: its pushes
-go through planes and limit like any x', x_{k-1} shifts alike, and the guard forgets what it knew.
+fourth iteration the guard compares E + psi with that of the last check. psi is the augmented Lagrangian by the list and
+the multipliers of now, on both sides. A coarse correction of bodies in contact will come after the guard, before the
+prox: its pushes go through planes and limit like any x', x_{k-1} shifts alike, and the guard forgets the last check.
 """
 
 from __future__ import annotations
@@ -178,7 +178,9 @@ class _Run:
         self.hands = replace(self.hands, poses=self.hands.moved(groups(begun.shares)))
         self.current = begun.positions
         self._search(want)
-        self._move(want)
+        # what was stopped starts where it was: nearer to x_t + h v it would only be squashed
+        stopped = (begun.shares < 1.0)[surfaces.body] & ~surfaces.kinematic
+        self._move(torch.where(stopped[:, None], self.current, want))
         self.previous = self.current
 
     def _search(self, want: Tensor) -> None:
