@@ -10,8 +10,7 @@
 namespace pd {
 
 // Positions, velocities, info; then numbers of the contact, how far colliders were held back, and the history.
-using ContactOutputs =
-    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using ContactOutputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // The arrays of a contact plan, in their order.
 enum ContactArray : int {
@@ -39,26 +38,31 @@ enum ContactSize : int { size_bodies, size_colliders, size_capacity, contact_siz
 
 template <class T>
 ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertices) {
-  TORCH_CHECK_VALUE(arrays.size() == contact_array_count, "contact must have ", int(contact_array_count),
-                    " arrays, got ", arrays.size(), "; compile the scene again");
+  TORCH_CHECK_VALUE(arrays.size() == contact_array_count, "contact must have ",
+                    int(contact_array_count), " arrays, got ", arrays.size(),
+                    "; compile the scene again");
   const Place place{at::kCPU};
   const int32* sizes = sizes_view(arrays[contact_sizes], contact_size_count);
   ContactPlan<T> plan;
   plan.bodies = sizes[size_bodies];
   plan.colliders = sizes[size_colliders];
   plan.capacity = sizes[size_capacity];
-  const auto array = [&](ContactArray which, at::ScalarType type, std::int64_t rows, std::int64_t width,
-                         const char* meaning) -> const void* {
+  const auto array = [&](ContactArray which, at::ScalarType type, std::int64_t rows,
+                         std::int64_t width, const char* meaning) -> const void* {
     check_array(arrays[which], type, rows, width, place, "contact", meaning);
     return arrays[which].const_data_ptr();
   };
-  const auto ints = [&](ContactArray which, std::int64_t rows, std::int64_t width, const char* meaning) {
+  const auto ints = [&](ContactArray which, std::int64_t rows, std::int64_t width,
+                        const char* meaning) {
     return static_cast<const int32*>(array(which, at::kInt, rows, width, meaning));
   };
-  const auto reals = [&](ContactArray which, std::int64_t rows, std::int64_t width, const char* meaning) {
+  const auto reals = [&](ContactArray which, std::int64_t rows, std::int64_t width,
+                         const char* meaning) {
     return static_cast<const T*>(array(which, scalar_type<T>, rows, width, meaning));
   };
-  const auto rows_of_array = [&](ContactArray which) { return arrays[which].dim() ? arrays[which].size(0) : 0; };
+  const auto rows_of_array = [&](ContactArray which) {
+    return arrays[which].dim() ? arrays[which].size(0) : 0;
+  };
   plan.vertices = int(rows_of_array(contact_body));
   plan.body_vertices = int(body_vertices);
   plan.triangles = int(rows_of_array(contact_triangle));
@@ -70,16 +74,25 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
   plan.point = ints(contact_point, plan.points, 1, "vertices of surfaces");
   plan.body = ints(contact_body, plan.vertices, 1, "body of each vertex");
   plan.collider = ints(contact_collider, plan.vertices, 1, "collider of each vertex");
-  plan.touches_itself = ints(contact_touches_itself, plan.bodies, 1, "whether bodies touch themselves");
+  plan.touches_itself =
+      ints(contact_touches_itself, plan.bodies, 1, "whether bodies touch themselves");
   plan.point_order = ints(contact_point_order, plan.points, 1, "leaves of a tree");
   plan.triangle_order = ints(contact_triangle_order, plan.triangles, 1, "leaves of a tree");
   plan.edge_order = ints(contact_edge_order, plan.edges, 1, "leaves of a tree");
-  plan.rest_key = static_cast<const std::int64_t*>(
-      array(contact_rest_key, at::kLong, plan.rest_pairs, 1, "keys of pairs that are close at rest"));
+  plan.rest_key = static_cast<const std::int64_t*>(array(
+      contact_rest_key, at::kLong, plan.rest_pairs, 1, "keys of pairs that are close at rest"));
   plan.rest_thickness = reals(contact_rest_thickness, plan.rest_pairs, 1, "their thickness [m]");
-  plan.local = reals(contact_local, plan.vertices - plan.body_vertices, 3, "points of colliders [m]");
+  plan.local =
+      reals(contact_local, plan.vertices - plan.body_vertices, 3, "points of colliders [m]");
   plan.cell = reals(contact_cell, plan.vertices, 1, "mean edge of each vertex's body [m]");
-  plan.friction = reals(contact_friction, plan.bodies, plan.bodies, "friction of pairs of bodies");
+  // [bodies, bodies], also of one body
+  check_storage(arrays[contact_friction], scalar_type<T>, place, "contact",
+                "friction of pairs of bodies");
+  TORCH_CHECK_VALUE(arrays[contact_friction].numel() == std::int64_t(plan.bodies) * plan.bodies,
+                    "contact must have a friction of every pair of its ", plan.bodies,
+                    " bodies, got ", describe(arrays[contact_friction]),
+                    "; compile the scene again");
+  plan.friction = arrays[contact_friction].const_data_ptr<T>();
   plan.thickness = *reals(contact_thickness, 1, 1, "thickness [m]");
   return plan;
 }
@@ -92,7 +105,8 @@ ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at:
   call.plan = Backend::template plan_view<T>(t.plan, place);
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
-  TORCH_CHECK_VALUE(!settings.multilevel(), "contact_step takes Chebyshev and Jacobi, got another solver");
+  TORCH_CHECK_VALUE(!settings.multilevel(),
+                    "contact_step takes Chebyshev and Jacobi, got another solver");
   call.material = material_view<T>(call.plan, t.material, call.batch, place);
   call.effects =
       effects_view<T>(Backend::stencil_counts(call), call.plan.tets, t.material, call.batch, place);
@@ -118,30 +132,36 @@ ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at:
     TORCH_CHECK_VALUE(tensor.sizes() == shape, name, " must be ", shape, " (", meaning, "), got ",
                       describe(tensor));
   };
-  TORCH_CHECK_VALUE(history.size() == 3, "history must be poses, keys and forces, got ", history.size(),
-                    " arrays");
+  TORCH_CHECK_VALUE(history.size() == 3, "history must be poses, keys and forces, got ",
+                    history.size(), " arrays");
   check(poses, real, {b, c, 7}, "poses", "of colliders at the step's end");
   check(history[0], real, {b, c, 7}, "history.poses", "actual poses of colliders");
   check(history[1], at::kLong, {b, m}, "history.keys", "pairs with forces");
   check(history[2], real, {b, m, 4}, "history.forces", "N");
   const Tensor info = at::empty({b, contact_info_count}, x.options().dtype(at::kDouble)),
-               held = at::empty({b, c}, x.options()), next_poses = at::empty({b, c, 7}, x.options()),
+               held = at::empty({b, c}, x.options()),
+               next_poses = at::empty({b, c, 7}, x.options()),
                next_keys = at::empty({b, m}, history[1].options()),
                next_forces = at::empty({b, m, 4}, x.options());
-  of.history = {history[0].const_data_ptr<T>(),          history[1].const_data_ptr<std::int64_t>(),
-                history[2].const_data_ptr<T>(),          next_poses.mutable_data_ptr<T>(),
-                next_keys.mutable_data_ptr<std::int64_t>(), next_forces.mutable_data_ptr<T>()};
+  of.history = {history[0].const_data_ptr<T>(),
+                history[1].const_data_ptr<std::int64_t>(),
+                history[2].const_data_ptr<T>(),
+                next_poses.mutable_data_ptr<T>(),
+                next_keys.mutable_data_ptr<std::int64_t>(),
+                next_forces.mutable_data_ptr<T>()};
   of.poses = poses.const_data_ptr<T>();
   of.info = info.mutable_data_ptr<double>();
   of.held_back = held.mutable_data_ptr<T>();
   if (b > 0) Backend::contact_step(call, of);
-  return {t.out_positions, t.out_velocities, t.info, info, held, next_poses, next_keys, next_forces};
+  return {t.out_positions, t.out_velocities, t.info,     info, held,
+          next_poses,      next_keys,        next_forces};
 }
 
 template <class Backend>
 ContactOutputs contact_step(const Numbers& n, const Tensor& positions, const Tensor& velocities,
-                            const OptionalTensor& forces, const Tensor& poses, at::TensorList history,
-                            at::TensorList material, at::TensorList plan, at::TensorList contact) {
+                            const OptionalTensor& forces, const Tensor& poses,
+                            at::TensorList history, at::TensorList material, at::TensorList plan,
+                            at::TensorList contact) {
   check_positions(positions, "positions");
   check_state(velocities, positions, "velocities", "m/s");
   if (forces) check_state(*forces, positions, "forces", "N");

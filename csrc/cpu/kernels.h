@@ -122,7 +122,8 @@ void contact_step_with(const StepCall<T>& call, const ContactCall<T>& contact, i
     Approach<T> approach(contact.plan);
     const Team alone = team.alone();
     for (std::int64_t e = next++; e < call.batch && !alone.ended(0); e = next++)
-      ContactStepper<T, HasContacts>(call, work, scratch, alone, e, contact, run, approach).rollout();
+      ContactStepper<T, HasContacts>(call, work, scratch, alone, e, contact, run, approach)
+          .rollout();
   });
 }
 

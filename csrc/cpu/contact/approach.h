@@ -26,7 +26,11 @@ class Approach {
   using Places = std::vector<Vec3<T>>;
 
   explicit Approach(const ContactPlan<T>& plan)
-      : plan_(plan), way_(plan.vertices), end_(plan.vertices), rigid_(plan.bodies), own_(plan.bodies),
+      : plan_(plan),
+        way_(plan.vertices),
+        end_(plan.vertices),
+        rigid_(plan.bodies),
+        own_(plan.bodies),
         pinned_(plan.bodies) {}
 
   // Moves the run's places toward its targets. `mass(vertex)`: of vertices of bodies.
@@ -37,7 +41,7 @@ class Approach {
     Places& place = run.place();
     for (int v = 0; v < plan_.body_vertices; ++v) {
       const int b = plan_.body[v];
-      way_[v] = own_[b] ? run.target()[v] - place[v]
+      way_[v] = own_[b]      ? run.target()[v] - place[v]
                 : pinned_[b] ? Vec3<T>{T(0), T(0), T(0)}
                              : narrow(rigid_[b].at(wide(place[v])));
       end_[v] = own_[b] ? run.target()[v] : place[v] + way_[v];
@@ -45,7 +49,7 @@ class Approach {
     for (int v = plan_.body_vertices; v < plan_.vertices; ++v) end_[v] = run.goal()[v];
     start_ = place;
     for (std::size_t c = 0; c < run.hands().size(); ++c) {
-      Hand<T>& hand = run.hands_to_move()[c];
+      Hand<T>& hand = run.hands()[c];
       const Screw<T> screw(hand.pose, hand.goal);
       if (screws_.size() <= c) screws_.push_back(screw);
       screws_[c] = screw;
@@ -59,18 +63,24 @@ class Approach {
       together_[b] = together_[b] + alone_[b] * (T(1) - together_[b]);
     for (int v = 0; v < plan_.vertices; ++v) place[v] = at(run, v, together_[plan_.body[v]]);
     for (std::size_t c = 0; c < run.hands().size(); ++c) {
-      Hand<T>& hand = run.hands_to_move()[c];
+      Hand<T>& hand = run.hands()[c];
       hand.pose = screws_[c].at(together_[plan_.body[hand.begin]]);
     }
   }
 
+  // Whether a body came less far than it wanted.
+  bool was_stopped(int body) const { return together_[body] < T(1); }
+
  private:
+  static T larger_rounding(const Vec3<T>& a, const Vec3<T>& b) {
+    return std::max(place_rounding(a), place_rounding(b));
+  }
+
   static Vec3<double> wide(const Vec3<T>& a) { return {double(a.x), double(a.y), double(a.z)}; }
   static Vec3<T> narrow(const Vec3<double>& a) { return {T(a.x), T(a.y), T(a.z)}; }
 
   template <class Mass>
-  void find_rigid_ways(const ContactRun<T>& run_, const Mass& mass) {
-    ContactRun<T>& run = const_cast<ContactRun<T>&>(run_);
+  void find_rigid_ways(ContactRun<T>& run, const Mass& mass) {
     const Places &place = run.place(), &target = run.target();
     std::fill(rigid_.begin(), rigid_.end(), RigidWay{});
     std::fill(pinned_.begin(), pinned_.end(), 0);
@@ -129,27 +139,26 @@ class Approach {
       reach[v] = square_root(dot(rest, rest));
     }
     for (int b = 0; b < plan_.bodies; ++b) own_[b] = rigid_[b].mass > 0;
-    run.search().each_boxed(
-        [&](int v) { return Box<T>{place[v], place[v]}; },
-        [&](int v) { return reach[v] + T(0.5) * plan_.thickness; },
-        [&](int v) { return run.moves_by_hand(v); },
-        [&](const ContactPair<T>& pair) {
-          const int b = plan_.body[pair.vertex[0]];
-          if (b != plan_.body[pair.vertex[3]] || !own_[b]) return;
-          Vec3<T> start[4], end[4];
-          pair.corners(place, start);
-          pair.corners(target, end);
-          const Closest<T> near = closest_points(pair.edges, start);
-          T side[2] = {T(0), T(0)};
-          for (int a = 0; a < 4; ++a) {
-            T& most = side[pair.on_a(a) ? 0 : 1];
-            most = std::max(most, reach[pair.vertex[a]]);
-          }
-          if (!(near.distance <= side[0] + side[1] + plan_.thickness)) return;
-          const Kept kept = direction_of(pair, start, end);
-          const T gap = gap_along(pair.edges, kept.normal, end);
-          own_[b] = !(gap < kept.least) && kept.least > gap_bound(end);
-        });
+    run.search().each_boxed([&](int v) { return Box<T>{place[v], place[v]}; },
+                            [&](int v) { return reach[v] + T(0.5) * plan_.thickness; },
+                            [&](int v) { return run.moves_by_hand(v); },
+                            [&](const ContactPair<T>& pair) {
+                              const int b = plan_.body[pair.vertex[0]];
+                              if (b != plan_.body[pair.vertex[3]] || !own_[b]) return;
+                              Vec3<T> start[4], end[4];
+                              pair.corners(place, start);
+                              pair.corners(target, end);
+                              const Closest<T> near = closest_points(pair.edges, start);
+                              T side[2] = {T(0), T(0)};
+                              for (int a = 0; a < 4; ++a) {
+                                T& most = side[pair.on_a(a) ? 0 : 1];
+                                most = std::max(most, reach[pair.vertex[a]]);
+                              }
+                              if (!(near.distance <= side[0] + side[1] + plan_.thickness)) return;
+                              const Kept kept = direction_of(pair, start, end);
+                              const T gap = gap_along(pair.edges, kept.normal, end);
+                              own_[b] = !(gap < kept.least) && kept.least > gap_bound(end);
+                            });
   }
 
   // A direction with the largest gap at both ends, and the gap that must be kept along it: the floor, or the gap at the start
@@ -158,7 +167,8 @@ class Approach {
     Vec3<T> normal;
     T least;
   };
-  static Kept direction_of(const ContactPair<T>& pair, const Vec3<T> (&start)[4], const Vec3<T> (&end)[4]) {
+  static Kept direction_of(const ContactPair<T>& pair, const Vec3<T> (&start)[4],
+                           const Vec3<T> (&end)[4]) {
     const bool edges = pair.edges;
     const Closest<T> first = closest_points(edges, start), last = closest_points(edges, end);
     Vec3<T> by_a{T(0), T(0), T(0)}, by_b = by_a, own = by_a, both = by_a;
@@ -197,22 +207,38 @@ class Approach {
   template <class Visit>
   void each_between(ContactRun<T>& run, const Visit& visit) {
     const Places& place = run.place();
+    const auto swept = [&](int v) {
+      Box<T> box{place[v], place[v]};
+      box.add(end_[v]);
+      return box;
+    };
+    const auto reach = [&](int v) {
+      // a helix leaves the box of its ends by half a chord at most
+      const Vec3<T> chord = end_[v] - place[v];
+      const T bow = v < plan_.body_vertices ? T(0) : T(0.5) * square_root(dot(chord, chord));
+      return bow + T(0.5) * plan_.thickness;
+    };
+    if (!some_bodies_meet(swept, reach)) return;
     run.search().each_boxed(
-        [&](int v) {
-          Box<T> box{place[v], place[v]};
-          box.add(end_[v]);
-          return box;
-        },
-        [&](int v) {
-          // a helix leaves the box of its ends by half a chord at most
-          const Vec3<T> chord = end_[v] - place[v];
-          const T bow = v < plan_.body_vertices ? T(0) : T(0.5) * square_root(dot(chord, chord));
-          return bow + T(0.5) * plan_.thickness;
-        },
-        [&](int v) { return run.moves_by_hand(v); },
+        swept, reach, [&](int v) { return run.moves_by_hand(v); },
         [&](ContactPair<T>& pair) {
           if (plan_.body[pair.vertex[0]] != plan_.body[pair.vertex[3]]) visit(pair);
         });
+  }
+
+  // Whether the swept boxes of any two bodies meet.
+  template <class Swept, class Reach>
+  bool some_bodies_meet(const Swept& swept, const Reach& reach) {
+    boxes_.assign(plan_.bodies, Box<T>::none());
+    for (int n = 0; n < plan_.points; ++n) {
+      const int v = plan_.point[n];
+      boxes_[plan_.body[v]].add(swept(v).widened(reach(v)));
+    }
+    for (int a = 0; a < plan_.bodies; ++a) {
+      for (int b = a + 1; b < plan_.bodies; ++b)
+        if (boxes_[a].meets(boxes_[b])) return true;
+    }
+    return false;
   }
 
   // Groups of moving bodies that pairs couple: each goes by one share.
@@ -254,10 +280,13 @@ class Approach {
   // Whether a group may take a share of its ways, as others stand still.
   template <class Walls>
   bool goes(ContactRun<T>& run, int g, T share, const Walls& walls) const {
-    const auto place = [&](int v) { return group(plan_.body[v]) == g ? at(run, v, share) : start_[v]; };
+    const auto place = [&](int v) {
+      return group(plan_.body[v]) == g ? at(run, v, share) : start_[v];
+    };
     for (std::size_t n = 0; n < kept_.size(); ++n) {
       const ContactPair<T>& pair = list_.pairs[n];
-      if (group(plan_.body[pair.vertex[0]]) != g && group(plan_.body[pair.vertex[3]]) != g) continue;
+      if (group(plan_.body[pair.vertex[0]]) != g && group(plan_.body[pair.vertex[3]]) != g)
+        continue;
       Vec3<T> corner[4];
       for (int a = 0; a < 4; ++a) corner[a] = place(pair.vertex[a]);
       const T gap = gap_along(pair.edges, kept_[n].normal, corner);
@@ -266,7 +295,7 @@ class Approach {
     const Ball<T> anywhere{{T(0), T(0), T(0)}, T(HUGE_VAL)};
     for (int v = 0; v < plan_.body_vertices; ++v) {
       if (group(plan_.body[v]) != g || own_[plan_.body[v]]) continue;
-      const T margin = place_rounding(start_[v]);
+      const T margin = larger_rounding(start_[v], end_[v]);
       const bool fine = is_allowed(place(v), anywhere, [&](const auto& visit) {
         walls(v, start_[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
       });
@@ -296,11 +325,12 @@ class Approach {
         bool fine = true;
         each_of(b, [&](int v) {
           if (!fine) return;
-          const T margin = place_rounding(place[v]);
+          const T margin = larger_rounding(place[v], end_[v]);
           fine = is_allowed(at(run, v, done + s * rest), anywhere, [&](const auto& visit) {
             list_.each_space(v, visit);
             if (!own_[b])
-              walls(v, place[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
+              walls(v, place[v],
+                    [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
           });
         });
         return fine;
@@ -320,6 +350,7 @@ class Approach {
   std::vector<Screw<T>> screws_;  // of colliders
   std::vector<T> together_, alone_;
   std::vector<int> group_;
+  std::vector<Box<T>> boxes_;  // of bodies
   Places way_, end_, start_;
   std::vector<RigidWay> rigid_;
   std::vector<char> own_, pinned_;

@@ -3,6 +3,7 @@
 #include "contact/pairs/half_space.h"
 #include "contact/pairs/multiplier.h"
 #include "contact/pairs/separation.h"
+#include "contact/plane_sphere.h"
 #include "cpu/contact/tree.h"
 #include "cpu/contact/views.h"
 
@@ -32,6 +33,50 @@ struct ContactPair {
 
   void corners(const std::vector<Vec3<T>>& places, Vec3<T> (&out)[4]) const {
     for (int a = 0; a < 4; ++a) out[a] = places[vertex[a]];
+  }
+
+  bool has_force() const {
+    const Vec3<T>& t = force.tangential;
+    return force.normal > T(0) || t.x != T(0) || t.y != T(0) || t.z != T(0);
+  }
+
+  // sum w^2 / D
+  T yielding(const std::vector<T>& inverse) const {
+    T sum(0);
+    for (int a = 0; a < 4; ++a)
+      sum = multiply_add(near.weight[a] * near.weight[a], inverse[vertex[a]], sum);
+    return sum;
+  }
+
+  // weight on vertices that move freely
+  T freedom(const std::vector<T>& inverse) const {
+    T sum(0);
+    for (int a = 0; a < 4; ++a)
+      if (inverse[vertex[a]] > T(0)) sum = sum + absolute(near.weight[a]);
+    return sum;
+  }
+
+  Vec3<T> normal_at(const Closest<T>& at) const {
+    return at.distance > T(1e-9) ? (T(1) / at.distance) * at.diff : plane.normal;
+  }
+
+  // between two places, along the surface
+  Vec3<T> slip(const std::vector<Vec3<T>>& places, const std::vector<Vec3<T>>& begin,
+               const Closest<T>& at) const {
+    Vec3<T> moved[4];
+    for (int a = 0; a < 4; ++a) moved[a] = places[vertex[a]] - begin[vertex[a]];
+    return tangential(combined(at.weight, moved), normal_at(at));
+  }
+
+  // Whether d <= b_A + b_B + r, with b of a side the largest of its vertices.
+  template <class Radius>
+  bool is_within(const Radius& radius, T thickness) const {
+    T reach[2] = {T(0), T(0)};
+    for (int a = 0; a < 4; ++a) {
+      T& side = reach[on_a(a) ? 0 : 1];
+      side = std::max(side, T(radius(vertex[a])));
+    }
+    return near.distance <= reach[0] + reach[1] + thickness;
   }
 };
 
@@ -66,8 +111,11 @@ class PairSearch {
       const int vertex = plan_.point[n];
       each_partner(triangles_, side(&vertex, 1), -1, [&](int triangle) {
         const int* corner = plan_.triangle + 3 * triangle;
-        emit({{vertex, corner[0], corner[1], corner[2]}, false,
-              std::int64_t(vertex) * plan_.triangles + triangle, T(0), T(0)},
+        emit({{vertex, corner[0], corner[1], corner[2]},
+              false,
+              std::int64_t(vertex) * plan_.triangles + triangle,
+              T(0),
+              T(0)},
              held, visit);
       });
     }
@@ -76,8 +124,11 @@ class PairSearch {
       const int* a = plan_.edge + 2 * n;
       each_partner(edges_, side(a, 2), n, [&](int other) {
         const int* b = plan_.edge + 2 * other;
-        emit({{a[0], a[1], b[0], b[1]}, true,
-              first_edge + std::int64_t(n) * plan_.edges + other, T(0), T(0)},
+        emit({{a[0], a[1], b[0], b[1]},
+              true,
+              first_edge + std::int64_t(n) * plan_.edges + other,
+              T(0),
+              T(0)},
              held, visit);
       });
     }
@@ -148,7 +199,8 @@ struct PairList {
   // calls visit(pair, corner) for the pairs of a vertex
   template <class Visit>
   void each_of(int vertex, const Visit& visit) const {
-    for (int n = start[vertex]; n < start[vertex + 1]; ++n) visit(pairs[entry[n] / 4], entry[n] % 4);
+    for (int n = start[vertex]; n < start[vertex + 1]; ++n)
+      visit(pairs[entry[n] / 4], entry[n] % 4);
   }
 
   // calls visit(normal, bound, margin) for its half-spaces
@@ -181,8 +233,8 @@ void make_plane(ContactPair<T>& pair, const std::vector<Vec3<T>>& places,
   Vec3<T> corner[4], goal[4];
   pair.corners(places, corner);
   pair.corners(want, goal);
-  pair.plane = divide(pair.edges, corner, goal, pair.floor(),
-                      separate(pair.edges, corner, near, hand));
+  pair.plane =
+      divide(pair.edges, corner, goal, pair.floor(), separate(pair.edges, corner, near, hand));
 }
 
 }  // namespace pd::inline PD_TARGET

@@ -9,11 +9,11 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int contact_sweeps = 4;   // of multipliers in an iteration
-constexpr int search_pause = 5;     // least iterations between searches
-constexpr double ball_reach = 1.2;  // of what a vertex wants; see ball_cells
-constexpr double ball_room = 0.49;  // of the room to the nearest other side
-constexpr double ball_cells = 0.25;  // most radius of a ball, over the mean edge
+constexpr int contact_sweeps = 4;     // of multipliers in an iteration
+constexpr int search_pause = 5;       // least iterations between searches
+constexpr double ball_reach = 1.2;    // of what a vertex wants; see ball_cells
+constexpr double ball_room = 0.49;    // of the room to the nearest other side
+constexpr double ball_cells = 0.25;   // most radius of a ball, over the mean edge
 constexpr double least_yield = 1e-6;  // of the weights of a pair, on vertices that move freely
 
 template <class T>
@@ -23,7 +23,8 @@ class ContactRun {
 
   explicit ContactRun(const ContactPlan<T>& plan)
       : plan_(plan), search_(plan), held_(plan.vertices), inverse_(plan.vertices) {
-    for (Places* places : {&begin_, &place_, &target_, &goal_, &shift_}) places->resize(plan.vertices);
+    for (Places* places : {&begin_, &place_, &target_, &goal_, &shift_})
+      places->resize(plan.vertices);
     is_surface_.assign(plan.vertices, 0);
     for (int n = 0; n < plan.points; ++n) is_surface_[plan.point[n]] = 1;
     for (int v = plan.body_vertices; v < plan.vertices; ++v) {
@@ -34,15 +35,13 @@ class ContactRun {
   }
 
   const ContactPlan<T>& plan() const { return plan_; }
-  Places& place() { return place_; }             // of the present iterate
-  Places& target() { return target_; }           // of the next one, before contact
-  Places& goal() { return goal_; }               // of what moves by hand
+  Places& place() { return place_; }              // of the present iterate
+  Places& target() { return target_; }            // of the next one, before contact
+  Places& goal() { return goal_; }                // of what moves by hand
   std::vector<T>& inverse() { return inverse_; }  // 1 / D; 0 for what moves by hand
-  const PairList<T>& list() const { return list_; }
   bool moves_by_hand(int vertex) const { return held_[vertex] != 0; }
   bool was_cut(int vertex) const { return cut_[vertex] != 0; }
   bool is_at_rest() const { return !cut_any_ && !waits_; }
-  const std::vector<Hand<T>>& hands() const { return hands_; }
 
   double gap = HUGE_VAL;
   std::int64_t most_pairs = 0, searches = 0, shortened = 0, frozen = 0;
@@ -78,28 +77,29 @@ class ContactRun {
     const auto most = [&](int v) { return T(ball_cells) * plan_.cell[v]; };
     near_.clear();
     room_.assign(plan_.vertices, T(HUGE_VAL));
-    search_.each_boxed(
-        [&](int v) { return Box<T>{place_[v], place_[v]}; },
-        [&](int v) { return most(v) + T(0.5) * plan_.thickness; },
-        [&](int v) { return moves_by_hand(v); },
-        [&](ContactPair<T>& pair) {
-          Vec3<T> corner[4];
-          pair.corners(place_, corner);
-          pair.near = closest_points(pair.edges, corner);
-          if (!is_within(pair, most)) return;
-          for (int v : pair.vertex) room_[v] = std::min(room_[v], pair.near.distance);
-          near_.push_back(pair);
-        });
+    search_.each_boxed([&](int v) { return Box<T>{place_[v], place_[v]}; },
+                       [&](int v) { return most(v) + T(0.5) * plan_.thickness; },
+                       [&](int v) { return moves_by_hand(v); },
+                       [&](ContactPair<T>& pair) {
+                         Vec3<T> corner[4];
+                         pair.corners(place_, corner);
+                         pair.near = closest_points(pair.edges, corner);
+                         if (!pair.is_within(most, plan_.thickness)) return;
+                         for (int v : pair.vertex)
+                           room_[v] = std::min(room_[v], pair.near.distance);
+                         near_.push_back(pair);
+                       });
     for (int v = 0; v < plan_.vertices; ++v) {
       const Vec3<T> way = target_[v] - place_[v];
-      const T wanted = T(ball_reach) * square_root(dot(way, way)) + (held_[v] ? T(0) : plan_.thickness);
+      const T wanted =
+          T(ball_reach) * square_root(dot(way, way)) + (held_[v] ? T(0) : plan_.thickness);
       const T roomy = held_[v] ? T(0) : T(ball_room) * (room_[v] - plan_.thickness);
       radius(v) = std::min(std::max(wanted, roomy), most(v));
       balls_[v].center = place_[v];
     }
     list_.pairs.clear();
     for (ContactPair<T>& pair : near_) {
-      if (!is_within(pair, [&](int v) { return balls_[v].radius; })) continue;
+      if (!pair.is_within([&](int v) { return balls_[v].radius; }, plan_.thickness)) continue;
       make_plane(pair, place_, target_, pair.near, Vec3<T>{});
       list_.pairs.push_back(pair);
     }
@@ -112,8 +112,9 @@ class ContactRun {
     list_.index(plan_.vertices);
     look();
     for (ContactPair<T>& pair : list_.pairs) {
-      const auto at = std::lower_bound(known_.begin(), known_.end(), pair.key,
-                                       [](const Known& a, std::int64_t key) { return a.key < key; });
+      const auto at =
+          std::lower_bound(known_.begin(), known_.end(), pair.key,
+                           [](const Known& a, std::int64_t key) { return a.key < key; });
       if (at == known_.end() || at->key != pair.key) continue;
       pair.force = {at->force.normal, tangential(at->force.tangential, pair.normal)};
     }
@@ -125,7 +126,7 @@ class ContactRun {
       Vec3<T> corner[4];
       pair.corners(place_, corner);
       pair.near = closest_points(pair.edges, corner);
-      pair.normal = normal_of(pair, pair.near);
+      pair.normal = pair.normal_at(pair.near);
     }
   }
 
@@ -137,10 +138,10 @@ class ContactRun {
   Merits check(double energy) {
     Merits merits{checked_energy_, energy, checked_};
     for (const ContactPair<T>& pair : list_.pairs) {
-      const T yielding = yield_of(pair);
+      const T yielding = pair.yielding(inverse_);
       const auto psi = [&](const Places& places, const Closest<T>& at) {
-        return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction, at.distance,
-                                    slip_of(pair, places, at));
+        return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction,
+                                    at.distance, pair.slip(places, begin_, at));
       };
       if (checked_) {
         Vec3<T> corner[4];
@@ -160,7 +161,7 @@ class ContactRun {
     active_.clear();
     for (int p = 0; p < int(list_.pairs.size()); ++p) {
       ContactPair<T>& pair = list_.pairs[p];
-      if (!(freedom_of(pair) > T(least_yield))) {
+      if (!(pair.freedom(inverse_) > T(least_yield))) {
         pair.force = {};  // nothing can yield
         continue;
       }
@@ -188,8 +189,9 @@ class ContactRun {
         Vec3<T> between[4], before[4];
         pair.corners(shift_, between);
         pair.corners(begin_, before);
-        pair.force = advance(pair.force, T(1) / (c * sum), pair.thickness, pair.friction, pair.normal,
-                             combined(pair.near.weight, between), combined(pair.near.weight, before));
+        pair.force =
+            advance(pair.force, T(1) / (c * sum), pair.thickness, pair.friction, pair.normal,
+                    combined(pair.near.weight, between), combined(pair.near.weight, before));
       }
     }
     push(c);
@@ -210,8 +212,8 @@ class ContactRun {
         ++frozen;
         continue;
       }
-      const LimitedPlace<T> to =
-          limit(target_[v], place_[v], balls_[v], [&](const auto& visit) { each_space(v, walls, visit); });
+      const LimitedPlace<T> to = limit(target_[v], place_[v], balls_[v],
+                                       [&](const auto& visit) { each_space(v, walls, visit); });
       shift_[v] = to.place;
       if (to.shortened) cut(v);
     }
@@ -240,7 +242,7 @@ class ContactRun {
   void remember() {
     known_.clear();
     for (const ContactPair<T>& pair : list_.pairs)
-      if (has_force(pair)) known_.push_back({pair.key, pair.force});
+      if (pair.has_force()) known_.push_back({pair.key, pair.force});
   }
 
   // calls visit(key, force), in the order of the keys
@@ -295,14 +297,8 @@ class ContactRun {
     return most;
   }
 
-  static bool has_force(const ContactPair<T>& pair) {
-    const Vec3<T>& t = pair.force.tangential;
-    return pair.force.normal > T(0) || t.x != T(0) || t.y != T(0) || t.z != T(0);
-  }
-
-  // for the approach
   PairSearch<T>& search() { return search_; }
-  std::vector<Hand<T>>& hands_to_move() { return hands_; }
+  std::vector<Hand<T>>& hands() { return hands_; }
 
  private:
   struct Known {
@@ -311,41 +307,6 @@ class ContactRun {
   };
 
   T& radius(int v) { return balls_[v].radius; }
-
-  T yield_of(const ContactPair<T>& pair) const {
-    T sum(0);
-    for (int a = 0; a < 4; ++a)
-      sum = multiply_add(pair.near.weight[a] * pair.near.weight[a], inverse_[pair.vertex[a]], sum);
-    return sum;
-  }
-
-  T freedom_of(const ContactPair<T>& pair) const {
-    T sum(0);
-    for (int a = 0; a < 4; ++a)
-      if (inverse_[pair.vertex[a]] > T(0)) sum = sum + absolute(pair.near.weight[a]);
-    return sum;
-  }
-
-  Vec3<T> slip_of(const ContactPair<T>& pair, const Places& places, const Closest<T>& at) const {
-    Vec3<T> moved[4];
-    for (int a = 0; a < 4; ++a) moved[a] = places[pair.vertex[a]] - begin_[pair.vertex[a]];
-    return tangential(combined(at.weight, moved), normal_of(pair, at));
-  }
-
-  static Vec3<T> normal_of(const ContactPair<T>& pair, const Closest<T>& at) {
-    return at.distance > T(1e-9) ? (T(1) / at.distance) * at.diff : pair.plane.normal;
-  }
-
-  // Whether d <= b_A + b_B + r, with b of a side the largest of its vertices.
-  template <class Radius>
-  bool is_within(const ContactPair<T>& pair, const Radius& radius) const {
-    T reach[2] = {T(0), T(0)};
-    for (int a = 0; a < 4; ++a) {
-      T& side = reach[pair.on_a(a) ? 0 : 1];
-      side = std::max(side, T(radius(pair.vertex[a])));
-    }
-    return pair.near.distance <= reach[0] + reach[1] + plan_.thickness;
-  }
 
   // targets, shifted by the forces of active pairs
   void push(T c) {
@@ -376,7 +337,8 @@ class ContactRun {
   template <class Walls, class Visit>
   void each_space(int v, const Walls& walls, const Visit& visit) const {
     list_.each_space(v, visit);
-    const T margin = place_rounding(place_[v]);
+    const T here = place_rounding(place_[v]), there = place_rounding(target_[v]),
+            margin = here < there ? there : here;
     walls(v, place_[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
   }
 
@@ -397,7 +359,8 @@ class ContactRun {
       const auto at = [&](T share) {
         return share < T(1) ? multiply_add(share, way, place_[v]) : goal_[v];
       };
-      const T share = list_.is_stuck(v) ? T(0) : largest_share<T>([&](T s) { return allowed(v, at(s)); });
+      const T share =
+          list_.is_stuck(v) ? T(0) : largest_share<T>([&](T s) { return allowed(v, at(s)); });
       shift_[v] = share > T(0) ? at(share) : place_[v];
       if (share < T(1)) cut(v);
     }

@@ -13,8 +13,8 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   using Value = typename Lanes::Value;
   using Sum = Sums<Lanes>;
   using Base::call_, Base::contacts_, Base::done_, Base::least_, Base::next_omega_, Base::plan_,
-      Base::schedule_, Base::set_, Base::stop_, Base::sweep_, Base::theta_, Base::used_, Base::vertex,
-      Base::w_;
+      Base::schedule_, Base::set_, Base::stop_, Base::sweep_, Base::theta_, Base::used_,
+      Base::vertex, Base::w_;
 
  public:
   ContactStepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
@@ -47,7 +47,8 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
       run_.inverse()[v] = w_.inverse[i];
       run_.goal()[v] = place_of(i, w_.target[i]);
     }
-    const std::int64_t poses = environment_ * plan.colliders * 7, row = environment_ * plan.capacity;
+    const std::int64_t poses = environment_ * plan.colliders * 7,
+                       row = environment_ * plan.capacity;
     run_.begin(contact_.history.poses + poses, contact_.poses + poses, contact_.history.keys + row,
                contact_.history.forces + 4 * row);
     begun_ = false;
@@ -62,6 +63,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
       want([&](int i) { return w_.u[i]; });
       approach_.move(run_, [&](int v) { return mass(v); }, walls());
       run_.find();
+      stay_where_stopped();
       go();
       for (int i = 0; i < plan_.vertices; ++i) w_.before[i] = w_.u[i];
       return;
@@ -154,6 +156,15 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     }
   }
 
+  // What was stopped starts where it was: nearer to its guess it would only be squashed.
+  void stay_where_stopped() {
+    const ContactPlan<T>& plan = run_.plan();
+    for (int v = 0; v < plan.body_vertices; ++v) {
+      if (!run_.moves_by_hand(v) && approach_.was_stopped(plan.body[v]))
+        run_.target()[v] = run_.place()[v];
+    }
+  }
+
   // Moves toward the targets; returns the square of the change, or infinity while something is held up.
   double go() {
     run_.move(walls());
@@ -181,7 +192,8 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
       const Vec3<T> way = Lanes::vec3(w_.u[i] - w_.target[i]);
       displacement += double(dot(way, way));
     }
-    const bool met = stop_[0].is_met(set_.tolerance, schedule_[0].error_share(double(omega)), change, displacement);
+    const bool met = stop_[0].is_met(set_.tolerance, schedule_[0].error_share(double(omega)),
+                                     change, displacement);
     done_[0] = met && change < HUGE_VAL;
   }
 
@@ -225,11 +237,15 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     const ContactPlan<T>& plan = run_.plan();
     const std::int64_t count = std::int64_t(plan_.vertices) * 3, row = environment_ * plan.capacity,
                        poses = environment_ * plan.colliders * 7;
-    std::copy_n(call_.positions + environment_ * count, count, call_.out_positions + environment_ * count);
-    std::copy_n(call_.velocities + environment_ * count, count, call_.out_velocities + environment_ * count);
+    std::copy_n(call_.positions + environment_ * count, count,
+                call_.out_positions + environment_ * count);
+    std::copy_n(call_.velocities + environment_ * count, count,
+                call_.out_velocities + environment_ * count);
     std::copy_n(contact_.history.keys + row, plan.capacity, contact_.history.next_keys + row);
-    std::copy_n(contact_.history.forces + 4 * row, 4 * plan.capacity, contact_.history.next_forces + 4 * row);
-    std::copy_n(contact_.history.poses + poses, 7 * plan.colliders, contact_.history.next_poses + poses);
+    std::copy_n(contact_.history.forces + 4 * row, 4 * plan.capacity,
+                contact_.history.next_forces + 4 * row);
+    std::copy_n(contact_.history.poses + poses, 7 * plan.colliders,
+                contact_.history.next_poses + poses);
   }
 
   const ContactCall<T>& contact_;
@@ -238,8 +254,8 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   std::int64_t environment_;
   // displacements of the next iterate before contact; a Quad is aligned more than std::vector grants
   std::vector<Vec3<T>> free_ = std::vector<Vec3<T>>(plan_.vertices);
-  std::vector<int> inside_;        // internal number of the user's vertices
-  std::vector<char> touches_;      // [components]
+  std::vector<int> inside_;    // internal number of the user's vertices
+  std::vector<char> touches_;  // [components]
   bool begun_ = false;
 };
 

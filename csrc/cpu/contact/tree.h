@@ -23,6 +23,10 @@ struct Box {
   Box widened(T by) const {
     return {{low.x - by, low.y - by, low.z - by}, {high.x + by, high.y + by, high.z + by}};
   }
+  bool meets(const Box& other) const {
+    return low.x <= other.high.x && other.low.x <= high.x && low.y <= other.high.y &&
+           other.low.y <= high.y && low.z <= other.high.z && other.low.z <= high.z;
+  }
   static Box none() {
     const T far(HUGE_VAL);
     return {{far, far, far}, {-far, -far, -far}};

@@ -7,12 +7,13 @@ namespace pd {
 // The constant arrays of a scene with contact. Vertices have the user's numbers, those of bodies first.
 template <class T>
 struct ContactPlan {
-  const int *triangle, *edge, *point;                 // [triangles, 3], [edges, 2], [points]
-  const int *body, *collider;                         // [vertices]; -1 for vertices of bodies
-  const int *touches_itself;                          // [bodies]
+  const int *triangle, *edge, *point;                    // [triangles, 3], [edges, 2], [points]
+  const int *body, *collider;                            // [vertices]; -1 for vertices of bodies
+  const int* touches_itself;                             // [bodies]
   const int *point_order, *triangle_order, *edge_order;  // leaves of the trees
-  const std::int64_t* rest_key;  // [rest_pairs] of pairs that are closer than 2 r at rest, increasing
-  const T* rest_thickness;       // [rest_pairs]
+  const std::int64_t*
+      rest_key;             // [rest_pairs] of pairs that are closer than 2 r at rest, increasing
+  const T* rest_thickness;  // [rest_pairs]
   const T *local, *cell, *friction;  // [vertices, 3] of colliders; [vertices]; [bodies, bodies]
   int vertices = 0, body_vertices = 0, triangles = 0, edges = 0, points = 0, bodies = 0,
       colliders = 0, capacity = 0;
@@ -23,9 +24,9 @@ struct ContactPlan {
 // What a step leaves for the next one, of every environment.
 template <class T>
 struct ContactHistory {
-  const T* poses;                 // [batch, colliders, 7]
-  const std::int64_t* keys;       // [batch, capacity], increasing, -1 pads at the end
-  const T* forces;                // [batch, capacity, 4]: lambda, lambda_t
+  const T* poses;            // [batch, colliders, 7]
+  const std::int64_t* keys;  // [batch, capacity], increasing, -1 pads at the end
+  const T* forces;           // [batch, capacity, 4]: lambda, lambda_t
   T* next_poses;
   std::int64_t* next_keys;
   T* next_forces;
@@ -33,12 +34,12 @@ struct ContactHistory {
 
 // Numbers about the contact of an environment in the last step.
 enum ContactInfo : int {
-  contact_gap,        // least d / r, inf without pairs
-  contact_overflow,   // pairs that the capacity lacks
-  contact_pairs,      // most pairs in a list
+  contact_gap,       // least d / r, inf without pairs
+  contact_overflow,  // pairs that the capacity lacks
+  contact_pairs,     // most pairs in a list
   contact_searches,
-  contact_shortened,  // vertices whose way was cut, summed over iterations
-  contact_frozen,     // vertices that no plane let move, summed over iterations
+  contact_shortened,       // vertices whose way was cut, summed over iterations
+  contact_frozen,          // vertices that no plane let move, summed over iterations
   contact_pins_held_back,  // m
   contact_info_count
 };
@@ -47,9 +48,9 @@ template <class T>
 struct ContactCall {
   ContactPlan<T> plan;
   ContactHistory<T> history;
-  const T* poses;     // [batch, colliders, 7] at the step's end
-  double* info;       // [batch, contact_info_count]
-  T* held_back;       // [batch, colliders] m
+  const T* poses;  // [batch, colliders, 7] at the step's end
+  double* info;    // [batch, contact_info_count]
+  T* held_back;    // [batch, colliders] m
 };
 
 }  // namespace pd
