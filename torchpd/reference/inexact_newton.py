@@ -2,8 +2,8 @@
 
 The preconditioner has two parts. P = 1.8 M + Z (Hc^-1 - 1.8 Ac^-1) Z^T is that of L-BFGS, with the space Z of pieces
 made at every Newton iterate (`reference.piece_step`). It knows A, which resists out of the plane of cloth as in it; H
-does not. So two steps of a Chebyshev iteration for H go before and after it, with 3 x 3 blocks D >= H. They damp [1/4, 1]
-of D^-1 H and cannot diverge, so that the whole is positive where P is.
+does not. So two steps of a Chebyshev iteration for H go before and after it, with 3 x 3 blocks D >= H. They damp
+[1/4, 1] of D^-1 H and cannot diverge, so that the whole is positive where P is.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from .objective import Objective
 from .piece_step import PieceCycle
 from .pieces import Pieces
+from .problem import StepProblem
 from .solvers import Observer, _descend
 
 __all__ = ["NewtonModel", "inexact_newton"]
@@ -31,7 +31,7 @@ FORCING = 0.1  # share of |grad E| that conjugate gradients leave
 class NewtonModel:
     """The quadratic model of E at u, and its preconditioner."""
 
-    problem: Objective
+    problem: StepProblem
     displacement: Array  # [V, 3] u, m
     coarse: Callable[[Array], Array]  # applies P
 
@@ -83,7 +83,7 @@ class NewtonModel:
 
 
 def inexact_newton(
-    problem: Objective,
+    problem: StepProblem,
     first: Array,
     cycle: Callable[[Array], Array],
     pieces: Pieces,
