@@ -21,7 +21,7 @@ from ..scene.fibres import Fibres
 from ..scene.part import Body
 from ..scene.rod import Rod
 from ..scene.scene import Scene
-from ..scene.solvers import Chebyshev, Multilevel, Solver
+from ..scene.solvers import Chebyshev, Multilevel, Newton, Solver
 from ..scene.springs import Springs
 from ..scene.tie import Tie
 
@@ -57,6 +57,8 @@ def _solver_line(sim: Stepper) -> str:
         name = f"Chebyshev {sim.solver.schedule}"
     if isinstance(sim.solver, Multilevel):
         name = f"Multilevel {sim.solver.outer}"
+    if isinstance(sim.solver, Newton):
+        name = "Newton"
     stop = f"at most {sim.iterations}" if sim.tolerance else f"{sim.iterations}"
     rho = f", rho {settings['rho']:g}" if settings["rho"] else ""
     diagonal = "weighted" if settings["weighted"] else "plain"
@@ -101,7 +103,7 @@ def _preconditioner_lines(sim: Stepper) -> list[str]:
     plan = sim.plan
     if not has_preconditioner(plan.arrays):
         return []
-    whose = "" if isinstance(sim.solver, Multilevel) else " of gradients"
+    whose = "" if isinstance(sim.solver, Multilevel | Newton) else " of gradients"
     _, _, nodes, _, _, below, direct, *_ = plan.level_sizes.tolist()
     steps = [f"{plan.vertices} vertices", *(f"{count} nodes" for count in (nodes, below) if count)]
     solved = "solved directly" if direct else "the last solved directly"
@@ -245,14 +247,17 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     """Memory of a CPU step for one environment [B], besides plan, material and states; `real` bytes a number."""
     # five vectors of four numbers, two weights, and the slots of patches
     numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
-    if not isinstance(solver, Multilevel):
+    if not isinstance(solver, Multilevel | Newton):
         return real * numbers
     # four vectors of an iteration, four of a V-cycle, and eight L-BFGS pairs
-    numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
-    if solver.outer == "momentum":
+    momentum = isinstance(solver, Multilevel) and solver.outer == "momentum"
+    numbers += 4 * plan.vertices * (8 + (0 if momentum else 16))
+    if momentum:
         return real * numbers
     # the coarse space: two vectors, and two dense matrices of all pieces
     pieces = int(plan.level_sizes[7])
+    if isinstance(solver, Newton):  # rotation and twists of every tetrahedron
+        numbers += 18 * len(plan.tet_order)
     return real * (numbers + 8 * plan.vertices) + 8 * 2 * (_MODES * pieces) ** 2
 
 

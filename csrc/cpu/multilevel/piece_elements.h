@@ -6,6 +6,32 @@
 
 namespace pd::inline PD_TARGET {
 
+// The positive part of the second derivative of stencils. Numbers 3 j + a: component a of column j of F.
+template <class Kind, class R, class Own>
+void positive_second_derivative(const Vec3<R> (&f)[Kind::dims], const Own& own,
+                                R (&second)[3 * Kind::dims][3 * Kind::dims]) {
+  using T = scalar_of<R>;
+  constexpr int rows = 3 * Kind::dims;
+  const R none(T(0)), one(T(1)), half(T(0.5));
+  R found[rows][rows];
+  for (int c = 0; c < rows; ++c) {
+    Vec3<R> df[Kind::dims], dp[Kind::dims];
+    for (int j = 0; j < Kind::dims; ++j) {
+      df[j] = {c == 3 * j ? one : none, c == 3 * j + 1 ? one : none, c == 3 * j + 2 ? one : none};
+    }
+    stress_differential<Kind>(f, df, own.p, own.c, dp);
+    for (int j = 0; j < Kind::dims; ++j) {
+      found[3 * j][c] = dp[j].x;
+      found[3 * j + 1][c] = dp[j].y;
+      found[3 * j + 2][c] = dp[j].z;
+    }
+  }
+  for (int r = 0; r < rows; ++r) {
+    for (int c = 0; c < rows; ++c) second[r][c] = half * (found[r][c] + found[c][r]);
+  }
+  clamp_positive(second);
+}
+
 // Adds what the pieces of a patch have in common, pack by pack. A pack has the pieces of all its lanes; weights are zero elsewhere.
 // Tetrahedra that the same pieces move share their packs.
 template <class T, class Work>
@@ -160,7 +186,7 @@ class PieceElements {
     R share[n], second[rows][rows];
     stencils.corners(0, x);
     deform<Kind>(x, own.g, f);
-    second_derivative<Kind>(f, own, second);
+    positive_second_derivative<Kind>(f, own, second);
     auto* changes = reinterpret_cast<Change*>(slots_.strains.begin());
     auto* stresses = reinterpret_cast<Change*>(slots_.stresses.begin());
     for (int k = 0; k < pieces; ++k) {
@@ -187,31 +213,6 @@ class PieceElements {
         }
       }
     }
-  }
-
-  // Numbers 3 j + a: component a of column j of F.
-  template <class Kind, class Own>
-  static void second_derivative(const Vec3<R> (&f)[Kind::dims], const Own& own,
-                                R (&second)[3 * Kind::dims][3 * Kind::dims]) {
-    constexpr int rows = 3 * Kind::dims;
-    const R none(T(0)), one(T(1)), half(T(0.5));
-    R found[rows][rows];
-    for (int c = 0; c < rows; ++c) {
-      Vec3<R> df[Kind::dims], dp[Kind::dims];
-      for (int j = 0; j < Kind::dims; ++j) {
-        df[j] = {c == 3 * j ? one : none, c == 3 * j + 1 ? one : none, c == 3 * j + 2 ? one : none};
-      }
-      stress_differential<Kind>(f, df, own.p, own.c, dp);
-      for (int j = 0; j < Kind::dims; ++j) {
-        found[3 * j][c] = dp[j].x;
-        found[3 * j + 1][c] = dp[j].y;
-        found[3 * j + 2][c] = dp[j].z;
-      }
-    }
-    for (int r = 0; r < rows; ++r) {
-      for (int c = 0; c < rows; ++c) second[r][c] = half * (found[r][c] + found[c][r]);
-    }
-    clamp_positive(second);
   }
 
   // e G^T of a translation along e, and e x N of a turn: G = sum w_c g_c, N = sum w_c r_c g_c^T

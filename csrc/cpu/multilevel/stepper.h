@@ -21,6 +21,8 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
   using Sum = Sums<Lanes>;
   using Work = MultilevelWork<Lanes>;
   static constexpr int width = Lanes::environments, dots = Work::dots;
+
+ protected:
   using Base::call_, Base::contacts_, Base::done_, Base::in_, Base::plan_, Base::schedule_,
       Base::set_, Base::sweep_, Base::team_, Base::used_, Base::vertex, Base::w_;
 
@@ -29,22 +31,12 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
                     const Team& team, std::int64_t first, Work& outer)
       : Base(call, work, scratch, team, first),
         o_(outer),
-        lbfgs_(set_.learns()),
+        lbfgs_(set_.learns() && !set_.newton()),
         pieces_(plan_, team, work, outer.pieces),
         has_space_(pieces_.there()) {}
 
   // All steps of the call, with a record every `set_.every`.
-  void rollout() {
-    this->load();
-    this->assemble_diagonal();
-    compare_with_reference();
-    for (int t = 0; t < set_.steps; ++t) {
-      multilevel_step(*this);
-      if (this->is_ended()) return;
-      if ((t + 1) % set_.every == 0) this->store((t + 1) / set_.every - 1);
-      this->move_spheres();
-    }
-  }
+  void rollout() { take_steps(*this); }
 
   void start() {
     Base::start();
@@ -53,8 +45,8 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
     const Wide friction = Lanes::widen(contacts_.friction());
     for (int lane = 0; lane < width; ++lane) {
       const bool has_friction = Lanes::lane(friction, lane) > 0;
-      search_[lane].begin(mismatch_[lane], HasContacts, has_friction, lbfgs_, energy_noise<T>(),
-                          this->stop_[lane].free_fall);
+      search_[lane].begin(mismatch_[lane], HasContacts, has_friction, set_.learns(),
+                          energy_noise<T>(), this->stop_[lane].free_fall);
       pairs_[lane] = {};
       made_[lane] = holds_[lane] = false;
       schedule_[lane].rho = mismatch_[lane].spread;
@@ -237,10 +229,37 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
     for (int lane = 0; lane < width; ++lane) schedule_[lane].restarts = search_[lane].restarts;
   }
 
- private:
+ protected:
+  // `self`: this, as what it is
+  template <class Self>
+  void take_steps(Self& self) {
+    this->load();
+    this->assemble_diagonal();
+    compare_with_reference();
+    for (int t = 0; t < set_.steps; ++t) {
+      multilevel_step(self);
+      if (this->is_ended()) return;
+      if ((t + 1) % set_.every == 0) this->store((t + 1) / set_.every - 1);
+      this->move_spheres();
+    }
+  }
+
   // whether contacts or pins that M does not know hold vertices, and the coarse space includes them
   bool is_held(int lane) const {
     return made_[lane] && (mismatch_[lane].has_outliers || pieces_.is_held(lane));
+  }
+
+  // Makes it at the iterates of all lanes.
+  void make_space() {
+    bool all[width];
+    double scales[width];
+    for (int lane = 0; lane < width; ++lane) {
+      all[lane] = made_[lane] = true;
+      scales[lane] = search_[lane].scale;
+    }
+    pieces_.make(o_.iterate, all, scales);
+    if constexpr (HasContacts) pieces_.hold(o_.free, all, scales);
+    uses_space_ = true;
   }
 
   // Makes the coarse space of the lanes that need it at iteration k, at their iterates.
