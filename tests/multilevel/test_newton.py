@@ -98,5 +98,5 @@ def test_batches_have_the_bits_of_one() -> None:
 
 
 def test_a_gpu_is_refused() -> None:
-    with pytest.raises(RuntimeError, match="device must be the CPU for Newton.*Multilevel"):
+    with pytest.raises(RuntimeError, match=r"device must be the CPU for Newton.*Multilevel"):
         check_solver("newton", torch.device("cuda"))

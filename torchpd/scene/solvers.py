@@ -222,7 +222,8 @@ def check_solver(solver: object, device: torch.device) -> Solver:
         if isinstance(solver, type):
             given = f"the class {solver.__name__}: write {solver.__name__}()"
         raise TypeError(
-            f"Simulator: solver must be Jacobi, Chebyshev, Multilevel, Newton or one of {get_args(SolverName)}, got {given}"
+            f"Simulator: solver must be Jacobi, Chebyshev, Multilevel, Newton or one of {get_args(SolverName)}, "
+            f"got {given}"
         )
     if isinstance(solver, Multilevel) and device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"Simulator: device must be the CPU or a GPU for Multilevel, got {device}")
