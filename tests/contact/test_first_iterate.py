@@ -82,10 +82,10 @@ def test_a_plane_that_nothing_comes_near_changes_nothing(iterations: int, device
     assert np.abs(near - far).max() <= 1e-12 * np.abs(far).max()
 
 
-def early(problem: StepProblem, displacement: Array, forces: Array | None = None) -> Array:
+def corrected(problem: StepProblem, displacement: Array, forces: Array | None = None) -> Array:
     """A displacement [V, 3] m as corrected before the iterations, from the forces [C, V, 3] N of contacts."""
     given = pushes_of(problem, displacement, problem.gradient(displacement)) if forces is None else forces
-    return correct(problem, displacement, given, early=True).displacement
+    return correct(problem, displacement, given).displacement
 
 
 def stretching(youngs: float, *planes: pd.Part, **options: Any) -> Case:
@@ -108,9 +108,9 @@ def test_it_starts_in_the_shape_of_less_energy(
     case = stretching(youngs, *planes)
     problem = rounded_problem(case, dtype).with_diagonal(weighted=weighted)
     still = np.zeros_like(problem.positions)
-    guess = early(problem, problem.unsolved())
+    guess = corrected(problem, problem.unsolved())
     # nothing strains the present shape, so that no contact has a force there
-    present = early(problem, still, np.zeros((len(planes), *still.shape)))
+    present = corrected(problem, still, np.zeros((len(planes), *still.shape)))
     energies = [problem.energy(u) for u in (guess, present)]
     assert (energies[0] < 0.8 * energies[1]) == (youngs == 1e4)
     assert (energies[1] < 0.8 * energies[0]) == (youngs == 1e6)
@@ -138,7 +138,7 @@ def test_what_the_ground_pushes_weighs_in_the_choice(youngs: float, dtype: torch
     case = sinking(youngs)
     problem = rounded_problem(case, dtype)
     still = np.zeros_like(problem.positions)
-    guess, present = early(problem, problem.unsolved()), early(problem, still, still[None])
+    guess, present = corrected(problem, problem.unsolved()), corrected(problem, still, still[None])
     assert (problem.energy(guess) < 0.97 * problem.energy(present)) == (youngs <= 1e5)
     first = problem.first_iterate()
     assert np.abs(first - (guess if youngs <= 1e5 else present)).max() <= 1e-5 * np.abs(first).max()

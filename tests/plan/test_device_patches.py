@@ -203,16 +203,16 @@ def test_parts_hold_each_free_vertex_once(plan: Arrays, values: SceneValues) -> 
 
 
 @pytest.mark.parametrize("kernel", [BLOCK, GRID, STREAM])
-def test_a_lane_has_one_vertex_of_a_part(case: tuple[str, int], kernel: int) -> None:
-    """32 at most, and 32 but for the last of a piece in a patch."""
+def test_parts_are_full(case: tuple[str, int], kernel: int) -> None:
+    """They have 128 vertices, but for the last of a piece in a patch."""
     plan = arrays_of(case, kernel)
     sizes = np.diff(plan.part_start)
     for first, last in itertools.pairwise(plan.patch_part):
         pieces = plan.slot_piece[plan.part_slot[plan.part_start[first:last]]]
         for piece in np.unique(pieces):
             mine = sizes[first:last][pieces == piece]
-            assert (mine[:-1] == 32).all()
-            assert 0 < mine[-1] <= 32
+            assert (mine[:-1] == 128).all()
+            assert 0 < mine[-1] <= 128
 
 
 @pytest.mark.parametrize("cells", [(2, 2, 2), (15, 3, 3), (40, 14, 14)])

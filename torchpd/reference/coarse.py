@@ -6,9 +6,9 @@ that pairs join. Elastic energy does not change, so q minimises
     Phi(q) = sum a / 2 |u(q) - s|^2 + sum of the envelopes (`reference.envelopes`) at u(q),
 
 with a fixed friction radius r. Pieces of bodies move alike (`reference.piece_step`), with E in place of the first sum.
-An outer step minimises Phi with gaps and slips to first order, which is convex: Newton's steps, each ended by an exact
-search, and r moves toward friction l in between. The outer step halves the motion until Phi has not risen. The pushes p
-of the touching vertices follow, contact by contact. At a converged step q = 0 and p = 0.
+Newton's steps, each a finite motion, shortened where Phi rises or has turned upward. In between, r moves toward
+friction l. The last step is small, and unchecked. The pushes p of the touching vertices follow, contact by contact. At
+a converged step q = 0 and p = 0.
 """
 
 from __future__ import annotations
@@ -35,14 +35,13 @@ __all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "isl
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-OUTER = 10  # finite motions
-PASSES = 12  # Newton's steps to one of them
-CUTS = 8  # of a step that raises Phi
-HELD = 1e-8  # eigenvalue of the pins' mean square displacement, in lengths of the body, below which a twist is free
-STILL = 1e-7  # of the size of a body: a step that may be left
+PASSES = 1024  # states at which Phi is looked at
+ONE_POINT = 1e-6  # of a body's size and distance from the origin, which float32 rounds: pins so near lie at a point
+ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
+STILL = 1e-7  # of the size of a body: a step that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
-EARLY = 1e-3  # both, before the iterations
-SETTLED = 0.1  # of a motion: a next step that ends it, once friction radii follow; of these: a lag made up at once
+SETTLED = 0.1  # of the motion since radii moved: a step with which they move again; of them: a lag made up at once
+FLAT = 0.5  # of the slope of Phi at the start of a step: an upward one at its end
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
 
 
@@ -95,6 +94,10 @@ class Motions(ABC):
     def after(self, motion: Array) -> Self:
         """The same after motions [N]; hard pins stay."""
 
+    def way(self, motion: Array) -> Array:
+        """Motions [N] here by which a share of `motion`, which led here, changes."""
+        return motion
+
     @property
     @abstractmethod
     def energy(self) -> float:
@@ -124,10 +127,15 @@ class RigidMotions(Motions):
             return (weight * y).sum(axis=0) / weight.sum(), np.eye(6)
         # about the mean of the pins: what they leave free are turns alone
         centre = y[~free].mean(axis=0)
-        lengths = np.repeat([1.0, float(np.linalg.norm(y - centre, axis=1).max())], 3)
-        pinned = twists(y[~free] - centre).reshape(-1, 6) / lengths
-        values, vectors = np.linalg.eigh(pinned.T @ pinned / int((~free).sum()))
-        return centre, vectors[:, values < HELD] / lengths[:, None]
+        arms = y[~free] - centre
+        apart, axes = np.linalg.eigh(arms.T @ arms / len(arms))
+        weight = np.where(free, self.problem.weight[body], 0.0)[:, None]
+        total = float(weight.sum()) or 1.0
+        square = float((weight * (y - (weight * y).sum(axis=0) / total) ** 2).sum() / total)
+        turns = axes
+        if apart[2] > ONE_POINT**2 * (square + float(centre @ centre)):
+            turns = axes[:, 2:] if apart[1] <= ONE_LINE**2 * apart[2] else axes[:, :0]
+        return centre, np.concatenate([np.zeros_like(turns), turns])
 
     @cached_property
     def parts(self) -> list[tuple[Index, Array, Array, slice, slice]]:
@@ -193,6 +201,14 @@ class RigidMotions(Motions):
             displacement[own] += _finite(basis @ motion[columns], arms)
         return replace(self, displacement=displacement)
 
+    def way(self, motion: Array) -> Array:
+        way = motion.copy()
+        for _, _, basis, _, columns in self.parts:
+            turn = (basis @ motion[columns])[3:]
+            # about the axis of the turn; a body with pins only turns
+            way[columns][-3:] *= 1.0 / (1.0 + 0.25 * float(turn @ turn))
+        return way
+
     @property
     def energy(self) -> float:
         """sum a / 2 |u - s|^2 [J] of the free vertices of the island."""
@@ -220,7 +236,6 @@ def correct(
     pairs: PairContacts | None = None,
     *,
     motions: MotionsOf = RigidMotions,
-    early: bool = False,
 ) -> Correction:
     """The coarse correction of every island.
 
@@ -230,7 +245,6 @@ def correct(
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
         motions: makes the motions of an island.
-        early: whether iterations go on from it, so that it may end sooner.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
     energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
@@ -238,7 +252,7 @@ def correct(
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, push, each, energy = _correct_island(moving, forces, own, early)
+        corrected, push, each, energy = _correct_island(moving, forces, own)
         pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
         energies[problem.values.component[[body[0] for body in bodies]]] = energy
@@ -258,82 +272,63 @@ def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[t
         yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
 
 
-def _correct_island(
-    motions: Motions, forces: Array, pairs: PairContacts | None, early: bool
-) -> tuple[Array, Array, Array, float]:
+def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, Array, float]:
     """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
-    contacts = contacts_at(problem, motions.displacement, forces, vertices, pairs)
+
+    def contacts_of(motions: Motions) -> Envelopes:
+        return contacts_at(problem, motions.displacement, forces, vertices, pairs)
+
+    contacts = contacts_of(motions)
     radius = contacts.friction * contacts.normal_anchors
-    still, behind = (EARLY, EARLY) if early else (STILL, LAG)
-    phi = motions.energy + contacts.energy(radius)
-    for _ in range(OUTER):
-        motion, radius = _model_minimum(motions, contacts, radius, still, behind)
-        if not motion.any():
-            break
-        energy = motions.energy + contacts.energy(radius)
-        for _ in range(CUTS + 1):
-            trial = motions.after(motion)
-            after = contacts_at(problem, trial.displacement, forces, vertices, pairs)
-            way = (contacts.weights[:, :, None] * (trial.displacement - motions.displacement)[contacts.vertices]).sum(1)
-            reached = trial.energy + replace(contacts.shifted(way), gaps=after.gaps).energy(radius)
-            if reached <= energy + ROUNDING * (motions.scale + energy):
+    phi, moved, left = motions.energy + contacts.energy(radius), 0.0, PASSES - 1
+    while True:
+        hessian, force = _newton_terms(motions, contacts, radius)
+        # a line has no inertia about itself
+        step: Array = np.asarray(np.linalg.lstsq(hessian, force, rcond=1e-12)[0], np.float64)
+        length = motions.share(step)
+        lag = contacts.friction * contacts.normal_forces() - radius
+        lagging, size = float(np.linalg.norm(lag)), float(np.linalg.norm(radius))
+        if lagging > LAG * size and length <= max(STILL, SETTLED * moved):
+            if not left:
                 break
-            motion = 0.5 * motion
+            left -= 1
+            radius, moved = radius + (1.0 if lagging <= SETTLED * size else 0.5) * lag, 0.0
+            continue
+        if lagging <= LAG * size and length <= STILL:
+            motions = motions.after(step)
+            contacts = contacts_of(motions)
+            break
+        share, energy = 1.0, motions.energy + contacts.energy(radius)
+        rounding = ROUNDING * (motions.scale + contacts.energy(radius))
+        while left:
+            left -= 1
+            trial = motions.after(share * step)
+            there = contacts_of(trial)
+            moved_by = (trial.displacement - motions.displacement)[contacts.vertices]
+            moves = (contacts.weights[:, :, None] * moved_by).sum(axis=1)
+            # by the normals of before, so that both energies are of one function
+            reached = trial.energy + replace(contacts.shifted(moves), gaps=there.gaps).energy(radius)
+            second, down = _newton_terms(trial, there, radius)
+            way = trial.way(share * step) / share
+            slope = -float(down @ way)
+            if reached <= energy + rounding and slope <= FLAT * float(force @ step):
+                break
+            # Newton's step from there, or half of it
+            nearer = share - slope / float(way @ second @ way)
+            share = nearer if 0.0 < nearer < share else 0.5 * share
         else:
             break
-        motions, contacts, phi = trial, after, reached
+        motions, contacts, phi, moved = trial, there, reached, moved + share * length
     return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
 
 
-def _model_minimum(
-    motions: Motions, contacts: Envelopes, radius: Array, still: float, behind: float
-) -> tuple[Array, Array]:
-    """Motions [N] of least Phi with gaps and slips to first order, and the friction radii [m] N that they leave.
-
-    Newton's steps, each ended where the model is least along it. Where the next one is small beside the motion, radii
-    go half way to friction l, unless they are near: what friction does to normal forces may drive them up and down. No
-    motion where the first step is small.
-    """
-    gradient, hessian, jacobian = motions.gradient, motions.hessian, motions.jacobian(contacts)
-    motion = np.zeros(len(gradient))
-
-    for _ in range(PASSES):
-        trial = contacts.shifted(jacobian @ motion)
-        second = trial.majoriser(radius)
-        on = second.any(axis=(1, 2))
-        matrix = hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-        force = np.einsum("min,mi->n", jacobian, trial.forces(radius)) - gradient - hessian @ motion
-        # a line has no inertia about itself
-        step = np.linalg.lstsq(matrix, force, rcond=1e-12)[0]
-        if motions.share(step) <= max(still, SETTLED * motions.share(motion)):
-            lag = contacts.friction * trial.normal_forces() - radius
-            left, size = np.linalg.norm(lag), np.linalg.norm(radius)
-            if left <= behind * size:
-                motion = motion + step if motion.any() else motion
-                break
-            radius = radius + (1.0 if left <= SETTLED * size else 0.5) * lag
-            continue
-        way, linear, quadratic = jacobian @ step, float(force @ step), float(step @ hessian @ step)
-        linear -= float((way * trial.forces(radius)).sum())
-
-        def slope(
-            share: float,
-            trial: Envelopes = trial,
-            way: Array = way,
-            linear: float = linear,
-            quadratic: float = quadratic,
-            radius: Array = radius,
-        ) -> float:
-            return share * quadratic - linear - float((way * trial.shifted(share * way).forces(radius)).sum())
-
-        low, high = 0.0, 1.0
-        if slope(1.0) > 1e-9 * abs(slope(0.0)):
-            for _ in range(30):
-                middle = 0.5 * (low + high)
-                low, high = (middle, high) if slope(middle) < 0.0 else (low, middle)
-        motion = motion + high * step
-    return motion, radius
+def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+    """The second derivative [N, N] of Phi by the motions, and minus the first [N]."""
+    jacobian, second = motions.jacobian(contacts), contacts.majoriser(radius)
+    on = second.any(axis=(1, 2))
+    matrix = motions.hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
+    return matrix, np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:

@@ -45,7 +45,7 @@ def first_iterate(problem: Objective, guess: Array) -> Array:
         for gradient, u in zip(gradients, states, strict=True)
     ]
     forces = [pushes_of(problem, u, g) for u, g in zip(states, (elastic[0], gradients[1]), strict=True)]
-    kept, moved = (correct(problem, u, f, early=True) for u, f in zip(states, forces, strict=True))
+    kept, moved = (correct(problem, u, f) for u, f in zip(states, forces, strict=True))
     anchors = [0.5 * (f**2).sum(axis=(0, 2)) / problem.diagonal for f in forces]
     work = 0.5 * ((elastic[0] + elastic[1]) * (states[1] - states[0])).sum(axis=1) + anchors[0] - anchors[1]
     for sign, after, answered in ((-1.0, kept, problem.target), (1.0, moved, states[1])):

@@ -64,11 +64,8 @@ struct VertexForces {
 
 template <class Lanes>
 CoarseVertex<typename Lanes::Wide> coarse_vertex(const Workspace<Lanes>& w, std::int64_t i) {
-  using Wide = typename Lanes::Wide;
-  const Wide none(0.0), inverse = Lanes::widen(w.inverse[i]);
-  const auto moves = inverse > none;
-  return {widened<Wide>(Lanes::vec3(w.x[i])), widened<Wide>(Lanes::vec3(w.u[i])),
-          select(moves, Wide(1.0) / select(moves, inverse, Wide(1.0)), none), inverse};
+  return {widened<typename Lanes::Wide>(Lanes::vec3(w.x[i])),
+          widened<typename Lanes::Wide>(Lanes::vec3(w.u[i])), Lanes::widen(w.inverse[i])};
 }
 
 template <class Lanes>
@@ -115,23 +112,22 @@ bool set_trial(Workspace<Lanes>& w, int g) {
     put_lane<Lanes>(to.center, lane, from.center);
     put_lane<Lanes>(to.shift_before, lane, from.shift_before);
     put_lane<Lanes>(to.shift_after, lane, from.shift_after);
-    put_lane<Lanes>(to.finite, lane, from.finite);
     put_lane<Lanes>(to.renews, lane, body.is_done() ? 0.0 : from.renews);
   }
   return goes_on;
 }
 
-// Motions of all bodies. `early`: before the iterations.
+// Motions of all bodies.
 template <bool HasContacts, class Lanes>
 void find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
-                  const Contacts<typename Lanes::Real>& contacts, bool early) {
+                  const Contacts<typename Lanes::Real>& contacts) {
   using Wide = typename Lanes::Wide;
   constexpr int lanes = Lanes::environments;
   sum_bodies(plan, w);
   for (int n = 0; n < plan.components * lanes; ++n) {
     double sum[RigidSums::count];
     read_lane<RigidSums::count, Lanes>(w.body_sums[n / lanes].rigid, n % lanes, sum);
-    w.bodies[n] = CoarseBody(RigidBody(sum), early);
+    w.bodies[n] = CoarseBody(RigidBody(sum));
     put_lane<Lanes>(w.body_sums[n / lanes].moves, n % lanes, w.bodies[n].moves() ? 1.0 : 0.0);
     const double none[ContactSums::count] = {};
     while (!HasContacts && !w.bodies[n].is_done()) w.bodies[n].pass(none);
@@ -148,7 +144,8 @@ void find_motions(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w,
     each_in_a_body<Lanes>(plan, [&](int i, int g) {
       if (!w.body_sums[g].goes_on) return;
       each_contact_term(contacts, coarse_vertex(w, i), w.trial[g],
-                        VertexForces<Lanes>{w, plan.vertices, i}, [&](bool adds, const auto& terms) {
+                        VertexForces<Lanes>{w, plan.vertices, i},
+                        [&](bool adds, const auto& terms) {
                           if (adds) add_terms(w.body_sums[g].contact, terms());
                         });
     });

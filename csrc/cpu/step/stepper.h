@@ -91,7 +91,7 @@ class Stepper {
       each_elastic_force(
           [&](std::int64_t i, const Vec3<Wide>& force) { keep_forces(i, force, Wide(1.0)); });
     }
-    correct(first);
+    correct();
     if (first) {
       each_that_moves([&](std::int64_t i) { w_.before[i] = w_.u[i]; });
       team_.barrier();
@@ -171,8 +171,8 @@ class Stepper {
   }
 
   // Moves every body by its rigid motion with the least energy, and then each vertex by what the contacts still push.
-  void correct(bool early) {
-    if (team_.rank == 0) find_motions<HasContacts>(plan_, w_, contacts_, early);
+  void correct() {
+    if (team_.rank == 0) find_motions<HasContacts>(plan_, w_, contacts_);
     team_.barrier();
     each_that_moves([&](std::int64_t i) {
       CoarseVertex<Wide> v = coarse_vertex(w_, i);
@@ -217,7 +217,7 @@ class Stepper {
     });
     team_.barrier();
     each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, 1.0); });
-    correct(true);
+    correct();
     if (team_.rank == 0) {
       for (int n = 0; n < plan_.components * width; ++n) w_.reached[n] = w_.bodies[n].reached();
       for (int g = 0; g < plan_.components; ++g) w_.motion_before[g] = w_.motion[g];
@@ -228,7 +228,7 @@ class Stepper {
     });
     team_.barrier();
     each_elastic_force([&](std::int64_t i, const Vec3<Wide>& force) { add_work(i, force, -1.0); });
-    correct(true);
+    correct();
     if (team_.rank == 0) sum_rises();
     team_.barrier();
     each_that_moves([&](std::int64_t i) {

@@ -34,7 +34,8 @@ class FusedRounds {
     const int end = plan.patch_part[index + 1];
     for (int n = plan.patch_part[index] + warp; n < end; n += warps) {
       const Part part(plan, n, false, -plan.patch_slot[index]);
-      sum_part<What>(of, plan, part, pieces[part.piece(plan)], part_sums + PartSums::count * plan.part_row[n]);
+      sum_part<What>(of, plan, part, pieces[part.piece(plan)],
+                     part_sums + PartSums::count * plan.part_row[n]);
     }
     sums.sync();
     for (int level = 0; level < plan.sum_levels; ++level) {
@@ -43,8 +44,10 @@ class FusedRounds {
         sum_rows<What>(plan, n, part_sums);
       sums.sync();
     }
-    for (int n = warp; n < plan.pieces; n += warps)
-      move_piece<What>(plan, n, of.contacts.exist(), of.is_early(), part_sums, pieces[n]);
+    for (int n = warp; n < plan.pieces; n += warps) sum_piece<What>(plan, n, part_sums, pieces[n]);
+    __syncthreads();
+    for (int n = threadIdx.x; n < plan.pieces; n += blockDim.x)
+      move_piece<What>(plan, n, of.contacts.exist(), pieces[n]);
     __syncthreads();
   }
 

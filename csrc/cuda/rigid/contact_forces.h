@@ -75,8 +75,7 @@ ContactForces<T> arrange_contact_forces(Arena& arena, const DeviceStep<T>& step,
 template <class T, bool HasContacts>
 PD_DEVICE CoarseVertex<double> coarse_vertex(const Vertex<Thread<T>, HasContacts>& vertex,
                                              const Vec3<T>& u) {
-  const double inverse = double(vertex.inverse);
-  return {widened<double>(vertex.x), widened<double>(u), inverse > 0 ? 1.0 / inverse : 0.0, inverse};
+  return {widened<double>(vertex.x), widened<double>(u), double(vertex.inverse)};
 }
 
 // A correction of the vertices of one environment. `i`: place of a vertex in `v`, `vertex`: its number.
@@ -88,7 +87,6 @@ struct Correction {
   ContactForces<T> forces;
   Iterate from;
 
-  PD_DEVICE bool is_early() const { return from != Iterate::last; }
   PD_DEVICE Vec3<T> present(int i) const { return v.at(i).current_iterate(contacts); }
   PD_DEVICE Vec3<T> guess(int i, int vertex) const { return v.first(i, in, vertex, contacts); }
 

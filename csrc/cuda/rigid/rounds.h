@@ -1,5 +1,5 @@
 // The rounds of the coarse correction of solver/coarse: sums over parts of pieces, a warp a part, and of these up a tree, a
-// warp a sum; then one thread of a warp decides for a piece.
+// warp a sum; then a thread decides for a piece.
 #pragma once
 #include "cuda/common/reductions.h"
 #include "cuda/rigid/contact_forces.h"
@@ -37,7 +37,7 @@ PD_HD std::int64_t count_rows(const DevicePlan<T>& plan) {
   return std::int64_t(plan.parts) + plan.sums;
 }
 
-// Slots of a part, at most one a lane.
+// Slots of a part.
 struct Part {
   const int *slot, *vertex;
   int begin, end;
@@ -58,25 +58,15 @@ struct Part {
     return plan.slot_piece[slot[begin]];
   }
 
-  // the lane's, or if it has none the first
-  PD_DEVICE int own() const { return has_own() ? begin + lane() : begin; }
-  PD_DEVICE bool has_own() const { return begin + lane() < end; }
+  PD_DEVICE int vertex_of(int at) const { return vertex[slot[at]]; }
+  PD_DEVICE int place_of(int at) const { return first + (by_vertex ? vertex_of(at) : slot[at]); }
 
   // calls visit(place, vertex) on one lane each
   template <class Visit>
   PD_DEVICE void each(const Visit& visit) const {
-    if (has_own()) visit_own(visit);
+    for (int at = begin + int(threadIdx.x) % warp_size; at < end; at += warp_size)
+      visit(place_of(at), vertex_of(at));
   }
-
-  // the same on all lanes
-  template <class Visit>
-  PD_DEVICE void visit_own(const Visit& visit) const {
-    const int at = slot[own()], number = vertex[at];
-    visit(first + (by_vertex ? number : at), number);
-  }
-
- private:
-  PD_DEVICE static int lane() { return int(threadIdx.x) % warp_size; }
 };
 
 // Sums over a warp; lane n gets value n. Each exchange halves the number of values per lane.
@@ -108,11 +98,11 @@ PD_DEVICE double write_shares(const double (&value)[Count], double* to) {
 }
 
 // The numbers that a round sums, in their order in PartSums.
-struct Range {
+struct RowNumbers {
   int begin, end;
 
   template <class T>
-  PD_DEVICE Range(Round what, const DevicePlan<T>& plan)
+  PD_DEVICE RowNumbers(Round what, const DevicePlan<T>& plan)
       : begin(what == Round::moments && !has_whole_parts(plan) ? RigidSums::target_offset : 0),
         end(what == Round::mean       ? RigidSums::target_offset
             : what == Round::moments  ? RigidSums::count
@@ -123,12 +113,12 @@ struct Range {
 
 // Lane n gets the sum of number n over rows. It bypasses the L1 cache, which may not hold the writes
 // of other blocks.
-PD_DEVICE_COLD double sum_over_rows(Range range, const double* row, int begin, int end) {
+PD_DEVICE double sum_over_rows(RowNumbers numbers, const double* row, int begin, int end) {
   const int lane = int(threadIdx.x) % warp_size;
   double own = 0;
 #pragma unroll 8
   for (int at = begin; at < end; ++at) {
-    if (range.has(lane)) own += __ldcg(row + std::int64_t(at) * PartSums::count + lane);
+    if (numbers.has(lane)) own += __ldcg(row + std::int64_t(at) * PartSums::count + lane);
   }
   return own;
 }
@@ -136,10 +126,10 @@ PD_DEVICE_COLD double sum_over_rows(Range range, const double* row, int begin, i
 // Sum n of a tree. `row`: [count_rows, PartSums::count]
 template <Round What, class T>
 PD_DEVICE void sum_rows(const DevicePlan<T>& plan, int n, double* row) {
-  const Range range(What, plan);
+  const RowNumbers numbers(What, plan);
   const int lane = int(threadIdx.x) % warp_size;
-  const double own = sum_over_rows(range, row, plan.sum_rows[2 * n], plan.sum_rows[2 * n + 1]);
-  if (range.has(lane)) row[(std::int64_t(plan.parts) + n) * PartSums::count + lane] = own;
+  const double own = sum_over_rows(numbers, row, plan.sum_rows[2 * n], plan.sum_rows[2 * n + 1]);
+  if (numbers.has(lane)) row[(std::int64_t(plan.parts) + n) * PartSums::count + lane] = own;
 }
 
 // The rounds that find the motions of all pieces. `run` takes the sums of a round, and knows whether
@@ -159,6 +149,62 @@ PD_DEVICE bool some_of(int count, const Is& is) {
   bool some = false;
   for (int n = threadIdx.x; n < count; n += blockDim.x) some = some || is(n);
   return __syncthreads_or(some);
+}
+
+// Calls add(whether a contact adds anything, what it adds) for every contact of a vertex of the part.
+template <class T, bool HasContacts, class Add>
+PD_DEVICE void each_term_of(const Correction<T, HasContacts>& of, const Part& part, int at,
+                            const CoarseTrial<double>& trial, const Add& add) {
+  const int i = part.place_of(at);
+  each_contact_term(of.contacts, coarse_vertex(of.v.at(i), vec3(of.v.u[i])), trial,
+                    of.forces.at(part.vertex_of(at)), add);
+}
+
+// Lane n gets the sum of number n of ContactSums over `count` vertices of a part, at most one a lane.
+template <class T, bool HasContacts>
+PD_DEVICE_COLD double sum_terms(const Correction<T, HasContacts>& of, const Part& part,
+                                const CoarseBody& body, const int* at, int count) {
+  const int lane = int(threadIdx.x) % warp_size;
+  double own = 0;
+  each_term_of(of, part, at[lane < count ? lane : 0], body.trial(),
+               [&](bool adds, const auto& terms) {
+                 adds = adds && lane < count;
+                 if (!__any_sync(full_warp, adds)) return;
+                 double sum[ContactSums::count] = {};
+                 if (adds) add_terms(sum, terms());
+                 own += share_out(sum);
+               });
+  return own;
+}
+
+// Few vertices touch something, anywhere in the part: they are queued until there is one for every lane. `to`: ContactSums;
+// before, the queue.
+template <class T, bool HasContacts>
+PD_DEVICE void sum_contacts(const Correction<T, HasContacts>& of, const Part& part,
+                            const CoarseBody& body, double* to) {
+  static_assert(sizeof(double) * PartSums::count >= sizeof(int) * 2 * warp_size);
+  const int lane = int(threadIdx.x) % warp_size;
+  int* const queue = reinterpret_cast<int*>(to);
+  const CoarseTrial<double> trial = body.trial();
+  double own = 0;
+  int queued = 0;
+  for (int begin = part.begin; begin < part.end + warp_size; begin += warp_size) {
+    bool touches = false;
+    if (begin + lane < part.end)
+      each_term_of(of, part, begin + lane, trial,
+                   [&](bool adds, const auto&) { touches = touches || adds; });
+    const unsigned touching = __ballot_sync(full_warp, touches);
+    if (touches) queue[queued + __popc(touching & ((1u << lane) - 1))] = begin + lane;
+    queued += __popc(touching);
+    __syncwarp();
+    if (queued < (begin < part.end ? warp_size : 1)) continue;
+    own += sum_terms(of, part, body, queue, queued);
+    queued -= warp_size;
+    __syncwarp();
+    if (lane < queued) queue[lane] = queue[warp_size + lane];
+    __syncwarp();
+  }
+  if (lane < ContactSums::count) to[lane] = own;
 }
 
 // `to`: PartSums
@@ -193,20 +239,7 @@ PD_DEVICE_COLD void sum_part(const Correction<T, HasContacts>& of, const DeviceP
       part.each([&](int i, int) { add_pin(held, double(v.inertia(i)), at(i) - center); });
     write_shares(held, to + S::pins);
   } else if constexpr (What == Round::contacts) {
-    if (piece.body.is_done()) return;
-    const int lane = int(threadIdx.x) % warp_size;
-    double own = 0;
-    part.visit_own([&](int i, int vertex) {
-      each_contact_term(of.contacts, coarse_vertex(v.at(i), vec3(v.u[i])), piece.body.trial(),
-                        of.forces.at(vertex), [&](bool adds, const auto& terms) {
-                          adds = adds && part.has_own();
-                          if (!__any_sync(full_warp, adds)) return;
-                          double sum[ContactSums::count] = {};
-                          if (adds) add_terms(sum, terms());
-                          own += share_out(sum);
-                        });
-    });
-    if (lane < ContactSums::count) to[lane] = own;
+    if (!piece.body.is_done()) sum_contacts(of, part, piece.body, to);
   } else {
     double sum[1] = {};
     part.each([&](int i, int vertex) {
@@ -216,31 +249,32 @@ PD_DEVICE_COLD void sum_part(const Correction<T, HasContacts>& of, const DeviceP
   }
 }
 
-// `row`: [count_rows, PartSums::count]. A warp for a piece. `early`: before the iterations.
+// Sums over a piece, by a warp. `row`: [count_rows, PartSums::count]
 template <Round What, class T>
-PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts, bool early,
-                               const double* row, Piece& to) {
+PD_DEVICE void sum_piece(const DevicePlan<T>& plan, int piece, const double* row, Piece& to) {
   const int lane = int(threadIdx.x) % warp_size;
-  if constexpr (What == Round::contacts) {
-    if (to.body.is_done()) return;
-  }
-  const Range range(What, plan);
+  const RowNumbers numbers(What, plan);
   const int* of = plan.piece_rows + 2 * piece;
-  const double own = sum_over_rows(range, row, of[0], of[1]);
-  double* const total = What == Round::contacts ? to.contact : What == Round::rises ? &to.rise : to.sum;
-  if (range.has(lane)) total[lane] = own;
-  __syncwarp();
-  if (lane != 0) return;
+  const double own = sum_over_rows(numbers, row, of[0], of[1]);
+  double* const total = What == Round::contacts ? to.contact
+                        : What == Round::rises  ? &to.rise
+                                                : to.sum;
+  if (numbers.has(lane)) total[lane] = own;
+}
+
+// What follows from them, by a thread.
+template <Round What, class T>
+PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts, Piece& of) {
   if constexpr (What == Round::moments) {
-    to.reached = to.body.reached();
-    to.motion_before = to.body.motion();
-    to.body = CoarseBody(RigidBody(to.sum), early);
-    for (double& sum : to.contact) sum = 0;
-    while (!has_contacts && !to.body.is_done()) to.body.pass(to.contact);
+    of.reached = of.body.reached();
+    of.motion_before = of.body.motion();
+    of.body = CoarseBody(RigidBody(of.sum));
+    for (double& sum : of.contact) sum = 0;
+    while (!has_contacts && !of.body.is_done()) of.body.pass(of.contact);
   } else if constexpr (What == Round::contacts) {
-    to.body.pass(to.contact);
+    if (!of.body.is_done()) of.body.pass(of.contact);
   } else if constexpr (What == Round::rises) {
-    to.rise = piece < plan.solid_pieces ? to.rise + (to.body.reached() - to.reached) : -1;
+    of.rise = piece < plan.solid_pieces ? of.rise + (of.body.reached() - of.reached) : -1;
   }
 }
 

@@ -31,8 +31,13 @@ struct SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread, FewRegister
     }
     for (int n = warp; n < r.here_ * r.plan_.pieces; n += warps) {
       const WorkItem item = r.item_of(n, r.plan_.pieces);
-      move_piece<What>(r.plan_, item.at, HasContacts, from != Iterate::last,
-                       r.part_sums(item.environment), r.piece(item.environment, item.at));
+      sum_piece<What>(r.plan_, item.at, r.part_sums(item.environment),
+                      r.piece(item.environment, item.at));
+    }
+    __syncthreads();
+    for (int n = threadIdx.x; n < r.here_ * r.plan_.pieces; n += blockDim.x) {
+      const WorkItem item = r.item_of(n, r.plan_.pieces);
+      move_piece<What>(r.plan_, item.at, HasContacts, r.piece(item.environment, item.at));
     }
     __syncthreads();
   }

@@ -48,8 +48,11 @@ class StreamRounds {
         sum_rows<What>(w_.plan, n, w_.part_sums());
       team_.barrier();
     }
-    for (int n = team_.warp(); n < w_.plan.pieces; n += team_.warps())
-      move_piece<What>(w_.plan, n, HasContacts, of_.is_early(), w_.part_sums(), w_.piece(n));
+    for (int n = team_.warp(); n < w_.plan.pieces; n += team_.warps()) {
+      sum_piece<What>(w_.plan, n, w_.part_sums(), w_.piece(n));
+      __syncwarp();
+      if (threadIdx.x % warp_size == 0) move_piece<What>(w_.plan, n, HasContacts, w_.piece(n));
+    }
     team_.barrier();
   }
 

@@ -22,7 +22,8 @@ namespace pd {
 
 namespace {
 
-constexpr int most_children = 32;  // of a sum over a piece: lanes of a warp
+constexpr int most_part = 128;     // vertices, which a warp sums
+constexpr int most_children = 32;  // rows of a sum over a piece
 
 // Computes the offsets of each patch's arrays.
 void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches, int members,
@@ -234,8 +235,7 @@ void place_forces(DeviceMeshPlan& plan) {
   }
 }
 
-// Lists the vertices of each free piece, patch by patch, in parts that each lane of a warp has at most one vertex of. Every
-// vertex belongs to the first patch that holds it.
+// Lists the vertices of each free piece, patch by patch, in parts. Every vertex belongs to the first patch that holds it.
 std::vector<std::int32_t> add_parts(DeviceMeshPlan& plan, const std::int32_t* piece) {
   plan.patch_part = plan.part_start = {0};
   std::vector<std::int32_t> part_piece;
@@ -251,8 +251,7 @@ std::vector<std::int32_t> add_parts(DeviceMeshPlan& plan, const std::int32_t* pi
     for (std::size_t i = 0; i < mine.size(); ++i) {
       plan.part_slot.push_back(mine[i].second);
       const std::int32_t size = std::int32_t(plan.part_slot.size()) - plan.part_start.back();
-      if (i + 1 < mine.size() && mine[i + 1].first == mine[i].first && size < most_children)
-        continue;
+      if (i + 1 < mine.size() && mine[i + 1].first == mine[i].first && size < most_part) continue;
       plan.part_start.push_back(std::int32_t(plan.part_slot.size()));
       part_piece.push_back(mine[i].first);
     }
@@ -268,8 +267,8 @@ void add_sums(DeviceMeshPlan& plan, const std::vector<std::int32_t>& part_piece,
   std::vector<std::int32_t> start(pieces + 1, 0);
   for (const std::int32_t number : part_piece) ++start[number + 1];
   std::partial_sum(start.begin(), start.end(), start.begin());
-  std::vector<std::int32_t> begin(start.begin(), start.end() - 1), next = begin,
-                            end(start.begin() + 1, start.end());
+  std::vector<std::int32_t> begin(start.begin(), start.end() - 1),
+      next = begin, end(start.begin() + 1, start.end());
   for (const std::int32_t number : part_piece) plan.part_row.push_back(next[number]++);
   const auto is_wide = [&](std::int32_t p) { return end[p] - begin[p] > most_children; };
   std::int32_t rows = std::int32_t(part_piece.size());
@@ -280,8 +279,7 @@ void add_sums(DeviceMeshPlan& plan, const std::vector<std::int32_t>& part_piece,
       if (!is_wide(p)) continue;
       const std::int32_t first = rows;
       for (std::int32_t child = begin[p]; child < end[p]; child += most_children, ++rows)
-        plan.sum_rows.insert(plan.sum_rows.end(),
-                             {child, std::min(child + most_children, end[p])});
+        plan.sum_rows.insert(plan.sum_rows.end(), {child, std::min(child + most_children, end[p])});
       begin[p] = first;
       end[p] = rows;
       wide = true;

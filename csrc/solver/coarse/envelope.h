@@ -130,12 +130,17 @@ PD_HD void add_terms(W (&sum)[ContactSums::count], const ContactTerms<W>& of) {
   }
 }
 
-// A vertex of a body that moves, in double: its position at the start of the step, its displacement at the iterate, D and
-// 1 / D, both 0 where a pin holds it.
+// A vertex of a body that moves, in double: its position at the start of the step, its displacement at the iterate, 1 / D.
 template <class W>
 struct CoarseVertex {
   Vec3<W> x, u;
-  W stiffness, inverse;
+  W inverse;  // 0: a pin holds it
+
+  // D, or 0
+  PD_HD W stiffness() const {
+    const auto moves = inverse > W(0.0);
+    return select(moves, W(1.0) / select(moves, inverse, W(1.0)), W(0.0));
+  }
 };
 
 template <class W>
@@ -192,8 +197,8 @@ PD_HD void keep_forces(const Contacts<R>& contacts, const CoarseVertex<W>& v, co
   const W none(0.0);
   Vec3<W> at = free;
   each_contact<W>(contacts, [&](int n, const auto& shape) {
-    const Vec3<W> next = project(shape, v.x, at, v.u);
-    const Vec3<W> force = v.stiffness * (next - at);
+    const Vec3<W> next = project(shape, v.x, at, v.u), way = next - at;
+    const Vec3<W> force = (any(dot(way, way) > none) ? v.stiffness() : none) * way;
     const W normal = dot(force, surface_at(shape, v.x, v.u).normal);
     forces.set(n, force, select(normal > none, shape.friction * normal, none));
     at = next;
@@ -209,6 +214,13 @@ PD_HD W anchor_energy(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
   return W(0.5) * v.inverse * square;
 }
 
+// Whether the envelope of a contact is more than 0 anywhere: without a force at the iterate, where the gap is negative.
+template <class W>
+PD_HD bool touches(const W& gap, const Vec3<W>& force, const W& radius) {
+  const W none(0.0);
+  return any(gap < none) || any(radius + dot(force, force) > none);
+}
+
 // How far the contacts push a vertex once its body has moved, one after another: (f - f0) / D.
 template <class R, class W, class Forces>
 PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, const Forces& forces) {
@@ -217,68 +229,62 @@ PD_HD Vec3<W> push_of(const Contacts<R>& contacts, const CoarseVertex<W>& v, con
   each_contact_in_turn<W>(
       contacts, v.inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
         const Surface<W> at = before_pushes(surface_at(shape, v.x, v.u + push), later);
-        const Envelope<W> envelope(v.stiffness, forces.force(n), at.normal);
-        push = push + v.inverse * (envelope.force(at, forces.radius(n)) - envelope.anchor(at.normal));
+        const Vec3<W> force = forces.force(n);
+        const W radius = forces.radius(n);
+        if (!touches(at.gap, force, radius)) return;
+        const Envelope<W> envelope(v.stiffness(), force, at.normal);
+        push = push + v.inverse * (envelope.force(at, radius) - envelope.anchor(at.normal));
       });
   return push;
 }
 
-// What a round asks of a body's vertices, per environment: the accepted motion and the trial, a finite motion, or to first
-// order a twist about the moved centre. `renews`: the share by which radii move toward friction l.
+// What a round asks of a body's vertices, per environment: the accepted motion and the trial. `renews`: the share by which
+// radii move toward friction l.
 template <class W>
 struct CoarseTrial {
-  Mat3<W> turn_before, turn_after;  // R - I; to first order [w]x R
+  Mat3<W> turn_before, turn_after;  // R - 1
   Vec3<W> center, shift_before, shift_after;
-  W finite, renews;  // 1 or 0; 1, 0.5 or 0
+  W renews;  // 1, 0.5 or 0
 };
 
 // Calls add(whether a contact of a vertex adds anything, what it adds: a function).
 template <class R, class W, class Forces, class Add>
 PD_HD void each_contact_term(const Contacts<R>& contacts, const CoarseVertex<W>& v,
                              const CoarseTrial<W>& trial, const Forces& forces, const Add& add) {
-  const Vec3<W> arm = (v.x + v.u) - trial.center, turned = trial.turn_before * arm;
-  const Vec3<W> first = v.u + (turned + trial.shift_before);
-  const Vec3<W> way = trial.turn_after * arm, then = v.u + (way + trial.shift_after);
+  const Vec3<W> arm = (v.x + v.u) - trial.center, way = trial.turn_after * arm;
+  const Vec3<W> first = v.u + (trial.turn_before * arm + trial.shift_before);
+  const Vec3<W> then = v.u + (way + trial.shift_after);
   const W none(0.0);
-  const auto finite = trial.finite > none;
-  const Vec3<W> lever = arm + select(finite, way, turned), moved = then - first;
   each_contact_in_turn<W>(
       contacts, v.inverse, forces, [&](int n, const auto& shape, const Vec3<W>& later) {
-        const Surface<W> before = before_pushes(surface_at(shape, v.x, first), later);
+        const Surface<W> before = before_pushes(surface_at(shape, v.x, first), later),
+                         after = before_pushes(surface_at(shape, v.x, then), later);
         // by the normal of before, so that both energies are of one function
-        Surface<W> there = {before.normal, before.gap + dot(before.normal, moved),
-                            before.slip + tangential(moved, before.normal)};
-        Surface<W> after = there;
-        if (any(finite)) {
-          const Surface<W> at = before_pushes(surface_at(shape, v.x, then), later);
-          there.gap = select(finite, at.gap, there.gap);
-          after = {select(finite, at.normal, there.normal), there.gap,
-                   select(finite, at.slip, there.slip)};
-        }
+        const Surface<W> there = {before.normal, after.gap,
+                                  before.slip + tangential(then - first, before.normal)};
         const Vec3<W> force = forces.force(n);
         const W last_radius = forces.radius(n);
-        const Envelope<W> old(v.stiffness, force, before.normal),
-            now(v.stiffness, force, after.normal);
-        const W normal = now.normal_force(after.gap);
-        const W size = ((old.normal_force(before.gap) + normal) + last_radius) + dot(force, force);
-        add(any(size > none), [&] {
-          ContactTerms<W> terms{};  // first-order passes need no energies
-          if (any(finite)) {
-            terms.before = v.inverse * old.energy(before, last_radius);
-            terms.after = v.inverse * old.energy(there, last_radius);
-          }
-          const W free = select(v.stiffness > none, W(1.0), none);
+        const W least = select(before.gap < after.gap, before.gap, after.gap);
+        add(touches(least, force, last_radius), [&] {
+          const W stiffness = v.stiffness();
+          const Envelope<W> old(stiffness, force, before.normal),
+              now(stiffness, force, after.normal);
+          const W normal = now.normal_force(after.gap);
+          ContactTerms<W> terms;
+          terms.before = v.inverse * old.energy(before, last_radius);
+          terms.after = v.inverse * old.energy(there, last_radius);
+          const W free = select(v.inverse > none, W(1.0), none);
           const W radius =
               multiply_add(trial.renews, shape.friction * normal - last_radius, last_radius);
           forces.set_radius(n, radius);
           terms.lag = free * (shape.friction * normal - radius);
           terms.radius = free * radius;
           const auto rub = now.rub(after.slip, radius);
-          terms.arm = lever;
+          terms.arm = arm + way;
           terms.normal = after.normal;
           terms.force = free * multiply_add(normal, after.normal, rub.share * rub.pull);
-          terms.across = rub.share * v.stiffness;
-          terms.along = select(normal > none, v.stiffness, none);
+          terms.across = rub.share * stiffness;
+          terms.along = select(normal > none, stiffness, none);
           return terms;
         });
       });

@@ -1,10 +1,9 @@
 // The rigid motion of a body with the least energy Phi: its quadratics (solver/coarse/sums.h) and the envelopes of its contacts
 // (solver/coarse/envelope.h).
 //
-// Each finite motion ends at the least Phi with gaps and slips to first order in a twist, which is convex: Newton's steps, each
-// ended where Phi is least along it. Where the next one is small beside the motion, radii of friction go half way to friction
-// times l, or all the way if they are near. The motion is halved until Phi itself has not risen. The passes end where no step
-// is left. A pass takes the contact sums of one trial. Vertices are moved once, at the end.
+// Newton's steps, each a finite motion, shortened where Phi rises or has turned upward. Where the next step is small beside
+// the motion, radii of friction go half way to friction times l, or all the way if they are near. A pass takes the contact
+// sums of one trial. The last step is small, and unchecked. Vertices are moved once, at the end.
 #pragma once
 #include "solver/coarse/envelope.h"
 #include "solver/coarse/sums.h"
@@ -20,17 +19,15 @@ struct RigidMotion {
   PD_HD Vec3<T> of(const Vec3<T>& y) const { return turn * (y - center) + shift; }
 };
 
-constexpr int most_motions = 10, most_steps = 12, most_cuts = 8, most_searches = 30;
-// Of the size of a body: a step that is left. Of the radii: how far behind friction l they may be left.
+constexpr int most_passes = 1024;
+// Of the size of a body: a step that ends the passes. Of the radii: how far behind friction l they may be left.
 constexpr double still_share = 1e-7, lag_share = 1e-6;
-// The same of both, before the iterations.
-constexpr double early_share = 1e-3;
-// Of a motion: a next step with which it ends, once radii have followed. Of these: a lag that they make up at once.
+// Of the motion since radii moved: a step with which they move again. Of these: a lag that they make up at once.
 constexpr double settled_share = 0.1;
+// Of the slope of Phi at the start of a step: an upward one at its end.
+constexpr double flat_share = 0.5;
 // Of the energy that moves a body by its size: a rise that is rounding.
 constexpr double energy_rounding = 1e-14;
-// Of the size of a body: how far a search along a step moves at its end.
-constexpr double exact_share = 1e-9;
 // Of the largest pivot: no inertia, such as that of a line about itself.
 constexpr double no_pivot = 1e-12;
 
@@ -54,11 +51,7 @@ class CoarseBody {
  public:
   CoarseBody() = default;
 
-  // `early`: before the iterations, which go on from it.
-  PD_HD CoarseBody(const RigidBody& body, bool early)
-      : body_(body),
-        still_(early ? early_share : still_share),
-        lag_(early ? early_share : lag_share) {
+  PD_HD explicit CoarseBody(const RigidBody& body) : body_(body) {
     size_ = square_root(body.square);
     length_ = size_ > 0 ? 1.0 / size_ : 1.0;
     accepted_ = trial_ = {{}, body.center, {0, 0, 0}};
@@ -68,22 +61,28 @@ class CoarseBody {
   PD_HD bool moves() const { return body_.weight > 0 && body_.hold != Hold::all; }
   PD_HD bool is_done() const { return done_; }
   PD_HD const RigidMotion<double>& motion() const { return accepted_; }
-  // Phi there, the quadratics relative to no motion
-  PD_HD double reached() const { return energy(accepted_) + contact_energy_; }
+  // Phi before the last step, the quadratics relative to no motion
+  PD_HD double reached() const { return reached_; }
 
   // What the next pass asks for.
   PD_HD CoarseTrial<double> trial() const {
-    return {accepted_.turn, trial_.turn,         body_.center, accepted_.shift,
-            trial_.shift,   finite_ ? 1.0 : 0.0, renews_};
+    return {accepted_.turn, trial_.turn, body_.center, accepted_.shift, trial_.shift, renews_};
   }
 
-  PD_HD void pass(const double (&sum)[ContactSums::count]) {
-    if (finite_ && !accept(sum)) return;
+  PD_CALLED void pass(const double (&sum)[ContactSums::count]) {
+    using S = ContactSums;
+    done_ = ++passes_ > most_passes;
+    if (done_) return;
+    const double before = energy(accepted_) + sum[S::before],
+                 after = energy(trial_) + sum[S::after];
+    const double rounding = energy_rounding * (body_.weight * body_.square + sum[S::before]);
     double terms[terms_count];
     find_terms(sum, terms);
-    if (share_ > 0 && !ends_step(terms)) return try_step();
-    for (int i = 0; i < 6; ++i) twist_[i] = multiply_add(share_, step_[i], twist_[i]);
-    decide(terms, sum[ContactSums::lag], sum[ContactSums::radius]);
+    if (share_ > 0 && !ends_step(terms, after <= before + rounding)) return try_step();
+    accepted_ = trial_;
+    reached_ = after;
+    moved_ += share_ * length_of(step_);
+    decide(terms, sum[S::lag], sum[S::radius]);
   }
 
  private:
@@ -97,68 +96,47 @@ class CoarseBody {
            frobenius(motion.turn, body_.covariance);
   }
 
-  // After the pass of a finite motion: halves its twist, or accepts it, and whether the passes go on from there.
-  PD_HD bool accept(const double (&sum)[ContactSums::count]) {
-    using S = ContactSums;
-    const double before = energy(accepted_) + sum[S::before],
-                 after = energy(trial_) + sum[S::after];
-    if (!(after <= before + energy_rounding * (body_.weight * body_.square + sum[S::before]))) {
-      done_ = ++cuts_ > most_cuts;
-      for (double& number : twist_) number *= 0.5;
-      if (!done_) try_motion();
-      return false;
-    }
-    accepted_ = trial_;
-    contact_energy_ = sum[S::after];
-    done_ = ++motions_ > most_motions;
-    if (done_) return false;
-    find_quadratics();
-    for (double& number : twist_) number = 0;
-    share_ = 0;
-    steps_ = cuts_ = 0;
-    return true;
-  }
-
-  // Whether Phi to first order is least here along the step; else how much of it to try next.
-  PD_HD bool ends_step(const double (&terms)[terms_count]) {
-    double slope = 0, second = 0;
+  // Whether the trial is good enough; else how much of the step to try next.
+  PD_HD bool ends_step(const double (&terms)[terms_count], bool falls) {
+    // of the twist by the share, about the axis of the turn: Cayley's formula
+    const Vec3<double> turn = share_ * turn_of(step_);
+    const double rate = 1.0 / (1.0 + 0.25 * dot(turn, turn));
+    double way[6], slope = 0, second = 0;
+    for (int i = 0; i < 6; ++i) way[i] = (i < 3 ? 1.0 : rate) * step_[i];
     PD_UNROLL
     for (int r = 0; r < 6; ++r) {
       double product = 0;
       PD_UNROLL
       for (int c = 0; c < 6; ++c)
-        product = multiply_add(terms[c < r ? at(r, c) : at(c, r)], step_[c], product);
-      second = multiply_add(product, step_[r], second);
-      slope = subtract_product(slope, terms[at(6, r)], step_[r]);
+        product = multiply_add(terms[c < r ? at(r, c) : at(c, r)], way[c], product);
+      second = multiply_add(product, way[r], second);
+      slope = subtract_product(slope, terms[at(6, r)], way[r]);
     }
-    // the slope rises: Newton's step within the bracket, or its middle
-    (slope < 0 ? low_ : high_) = share_;
-    double next = share_ - slope / second;
-    if (next != share_ && !(low_ < next && next < high_)) next = 0.5 * (low_ + high_);
-    if ((share_ == 1.0 && !(slope > 0)) ||
-        absolute(next - share_) * length_of(step_) <= exact_share * size_ ||
-        ++searches_ > most_searches)
-      return true;
-    share_ = next;
+    if (falls && slope <= flat_share * slope_) return true;
+    // Newton's step from here, or half of it
+    const double next = share_ - slope / second;
+    share_ = 0 < next && next < share_ ? next : 0.5 * share_;
     return false;
   }
 
-  // From the terms at the twist: Newton's next step; where that is small, radii are renewed, or it ends the motion.
+  // From the terms at the accepted motion: Newton's step, or radii are renewed. A small step is the last.
   PD_HD void decide(double (&terms)[terms_count], double lag, double radius) {
-    renews_ = 0;
-    if (++steps_ > most_steps) return try_motion();
+    double force[6];
+    for (int i = 0; i < 6; ++i) force[i] = terms[at(6, i)];
     solve(terms);
-    searches_ = 0;
-    low_ = 0, high_ = share_ = 1;
-    const double moved = length_of(twist_), least = still_ * size_, part = settled_share * moved;
-    if (length_of(step_) > (least > part ? least : part)) return try_step();
-    if (lag <= lag_ * lag_ * radius) {
-      for (int i = 0; i < 6 && moved > 0; ++i) twist_[i] += step_[i];
-      return try_motion();
+    slope_ = 0;
+    for (int i = 0; i < 6; ++i) slope_ = multiply_add(force[i], step_[i], slope_);
+    const double length = length_of(step_), least = still_share * size_;
+    const bool behind = lag > lag_share * lag_share * radius;
+    share_ = 1;
+    renews_ = 0;
+    if (behind && (length <= least || length <= settled_share * moved_)) {
+      renews_ = lag <= settled_share * settled_share * radius ? 1.0 : 0.5;
+      share_ = moved_ = 0;  // a pass at the accepted motion
     }
-    renews_ = lag <= settled_share * settled_share * radius ? 1.0 : 0.5;
-    share_ = 0;  // a pass at the twist
     try_step();
+    done_ = !behind && length <= least;
+    if (done_) accepted_ = trial_;
   }
 
   PD_HD static double length_of(const double (&twist)[6]) {
@@ -166,30 +144,16 @@ class CoarseBody {
            square_root(twist[3] * twist[3] + twist[4] * twist[4] + twist[5] * twist[5]);
   }
 
-  // The trial to first order: the twist and the step.
   PD_HD void try_step() {
-    finite_ = false;
-    double at[6];
-    for (int i = 0; i < 6; ++i) at[i] = multiply_add(share_, step_[i], twist_[i]);
-    set_trial(at, cross_matrix(turn_of(at)));
-  }
-
-  // The finite trial, unless no motion is left.
-  PD_HD void try_motion() {
-    finite_ = true;
-    done_ = length_of(twist_) == 0;
-    set_trial(twist_, small_turn(turn_of(twist_)));
+    const Mat3<double> more = small_turn(share_ * turn_of(step_)), product = more * accepted_.turn;
+    trial_.shift =
+        multiply_add(share_, Vec3<double>{step_[0], step_[1], step_[2]}, accepted_.shift);
+    for (int r = 0; r < 3; ++r)
+      trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
   }
 
   PD_HD Vec3<double> turn_of(const double (&twist)[6]) const {
     return length_ * Vec3<double>{twist[3], twist[4], twist[5]};
-  }
-
-  PD_HD void set_trial(const double (&twist)[6], const Mat3<double>& more) {
-    const Mat3<double> product = more * accepted_.turn;
-    trial_.shift = accepted_.shift + Vec3<double>{twist[0], twist[1], twist[2]};
-    for (int r = 0; r < 3; ++r)
-      trial_.turn.row[r] = (accepted_.turn.row[r] + more.row[r]) + product.row[r];
   }
 
   // R A
@@ -199,31 +163,22 @@ class CoarseBody {
     return product;
   }
 
-  // Of the quadratics at the accepted motion: minus the first derivative, and the second. In lengths: turns times the size.
-  PD_HD void find_quadratics() {
-    // sum a (r + d) r^T and sum a r r^T, with the arms and ways of now
-    const Mat3<double> covariance = transpose(turned(accepted_, transpose(body_.covariance)));
-    second_ = axis_matrix(covariance);
-    if (!is_positive(second_)) {
-      const Mat3<double> half = turned(accepted_, body_.second_moment);
-      second_ = axis_matrix(transpose(turned(accepted_, transpose(half))));
-    }
-    second_ = (length_ * length_) * second_;
-    force_ = subtract_product(body_.pull, body_.weight, accepted_.shift);
-    moment_ = length_ * axis_of(covariance);
-  }
-
-  // Of Phi to first order at the twist and a share of the step: the second derivative, and minus the first.
+  // Of Phi at the trial, by a twist in lengths, turns times the size: the second derivative, and minus the first.
   PD_HD void find_terms(const double (&sum)[ContactSums::count],
                         double (&terms)[terms_count]) const {
-    double now[6];
-    for (int i = 0; i < 6; ++i) now[i] = multiply_add(share_, step_[i], twist_[i]);
-    const Vec3<double> shift = {now[0], now[1], now[2]}, turn = {now[3], now[4], now[5]};
-    const Vec3<double> f = subtract_product(force_, body_.weight, shift),
-                       m = moment_ - second_ * turn;
+    // sum a (r + d) r^T and sum a r r^T, with the arms and ways of now
+    const Mat3<double> covariance = transpose(turned(trial_, transpose(body_.covariance)));
+    Mat3<double> second = axis_matrix(covariance);
+    if (!is_positive(second)) {
+      const Mat3<double> half = turned(trial_, body_.second_moment);
+      second = axis_matrix(transpose(turned(trial_, transpose(half))));
+    }
+    second = (length_ * length_) * second;
+    const Vec3<double> f = subtract_product(body_.pull, body_.weight, trial_.shift),
+                       m = length_ * axis_of(covariance);
     const double force[6] = {f.x, f.y, f.z, m.x, m.y, m.z};
-    const double turns[6] = {second_.row[0].x, second_.row[1].x, second_.row[1].y,
-                             second_.row[2].x, second_.row[2].y, second_.row[2].z};
+    const double turns[6] = {second.row[0].x, second.row[1].x, second.row[1].y,
+                             second.row[2].x, second.row[2].y, second.row[2].z};
     PD_UNROLL
     for (int r = 0; r <= 6; ++r) {
       PD_UNROLL
@@ -249,8 +204,8 @@ class CoarseBody {
       force = multiply_add(terms[at(6, 3 + r)], axis[r], force);
       PD_UNROLL
       for (int c = 0; c < 3; ++c)
-        along = multiply_add(terms[c < r ? at(3 + r, 3 + c) : at(3 + c, 3 + r)],
-                             axis[r] * axis[c], along);
+        along = multiply_add(terms[c < r ? at(3 + r, 3 + c) : at(3 + c, 3 + r)], axis[r] * axis[c],
+                             along);
     }
     PD_UNROLL
     for (int r = 0; r <= 6; ++r) {
@@ -279,7 +234,8 @@ class CoarseBody {
       for (int c = j + 1; c < 6; ++c) {
         const double factor = inverse[j] * a[at(c, j)];
         PD_UNROLL
-        for (int r = c; r <= 6; ++r) a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
+        for (int r = c; r <= 6; ++r)
+          a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
       }
     }
     PD_UNROLL
@@ -293,15 +249,12 @@ class CoarseBody {
 
   RigidBody body_;
   RigidMotion<double> accepted_, trial_;
-  Mat3<double> second_;
-  Vec3<double> force_, moment_;
-  double still_, lag_;    // of the size, and of the radii: that may be left
   double size_, length_;  // length_: 1 / size_
-  double twist_[6] = {}, step_[6] = {}, share_ = 0, low_ = 0, high_ = 1;
-  double contact_energy_ = 0;
-  int motions_ = 0, steps_ = 0, searches_ = 0, cuts_ = 0;
-  double renews_ = 0;  // share by which the pass moves radii toward friction l
-  bool finite_ = true, done_ = true;
+  // share_: of the step, tried. slope_: of Phi down the step, at its start. moved_: since radii moved. renews_: share by
+  // which the pass moves radii toward friction l.
+  double step_[6] = {}, share_ = 0, slope_ = 0, moved_ = 0, reached_ = 0, renews_ = 0;
+  int passes_ = 0;
+  bool done_ = true;
 };
 
 // One of the two first iterates of a step, at a vertex: its displacement before and after the correction, and the motion of

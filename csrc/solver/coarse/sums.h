@@ -68,8 +68,9 @@ PD_HD Mat3<double> symmetric(const double* s) {
 
 PD_HD double trace(const Mat3<double>& a) { return (a.row[0].x + a.row[1].y) + a.row[2].z; }
 
-// Pins lie at one point, or on one line, that are no further off than this share of the body's size.
-constexpr double pins_apart = 1e-4;
+// Pins lie at one point that are no further apart than this share of their body's size and distance from the origin, which
+// float32 rounds; and on one line that are no further from it than this share of what they are apart.
+constexpr double one_point = 1e-6, one_line = 1e-4;
 
 // What pins leave to a body.
 enum class Hold { none, point, line, all };
@@ -101,14 +102,16 @@ struct RigidBody {
   PD_COLD void turn_about_pins(const double (&sum)[RigidSums::count]) {
     using S = RigidSums;
     const double share = 1.0 / sum[S::pins];
-    const double* at = sum + S::pin_position;
-    const double mean[3] = {share * at[0], share * at[1], share * at[2]};
+    const double* position = sum + S::pin_position;
+    const double mean[3] = {share * position[0], share * position[1], share * position[2]};
     const Vec3<double> pivot = {mean[0], mean[1], mean[2]};  // from the mean of y
     Mat3<double> spread = share * symmetric(sum + S::pin_second_moment);
     for (int r = 0; r < 3; ++r) spread.row[r] = subtract_product(spread.row[r], mean[r], pivot);
     const SignedSvd<double> svd = signed_svd(spread);
-    const double apart = pins_apart * pins_apart * square;
-    hold = svd.s[1] > apart ? Hold::all : svd.s[0] > apart ? Hold::line : Hold::point;
+    const Vec3<double> at_pins = center + pivot;
+    hold = !(svd.s[0] > one_point * one_point * (square + dot(at_pins, at_pins))) ? Hold::point
+           : svd.s[1] > one_line * one_line * svd.s[0]                            ? Hold::all
+                                                                                  : Hold::line;
     axis = {svd.u.row[0].x, svd.u.row[1].x, svd.u.row[2].x};
     // arms are longer by -pivot: sum a r = -W pivot
     const double out[3] = {pull.x, pull.y, pull.z};
