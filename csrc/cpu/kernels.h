@@ -32,14 +32,14 @@ class Runner {
  public:
   Runner(const StepCall<T>& call, int threads) : call_(call) {
     if (call.settings.multilevel()) multilevel_.emplace(call, HasContacts, threads);
-    if (call.settings.newton()) frames_.emplace(call.plan, call.effects.poisson.data != nullptr);
+    if (call.settings.newton()) newton_.emplace(call.plan, call.effects.poisson.data != nullptr);
   }
 
   void rollout(Workspace<Lanes>& work, Scratch<Lanes>& scratch, const Team& team,
                std::int64_t first) {
-    if (frames_) {
+    if (newton_) {
       if constexpr (std::is_same_v<Lanes, Single<T>>) {
-        NewtonStepper<T, HasContacts>(call_, work, scratch, team, first, *multilevel_, *frames_)
+        NewtonStepper<T, HasContacts>(call_, work, scratch, team, first, *multilevel_, *newton_)
             .rollout();
       }
     } else if (multilevel_) {
@@ -53,7 +53,7 @@ class Runner {
  private:
   const StepCall<T>& call_;
   std::optional<MultilevelWork<Lanes>> multilevel_;
-  std::optional<RotationJacobians<T>> frames_;  // of Newton's method
+  std::optional<NewtonWork<T>> newton_;
 };
 
 template <class Lanes, bool HasContacts, class T>

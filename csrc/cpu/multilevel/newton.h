@@ -25,26 +25,29 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
  public:
   NewtonStepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
                 const Team& team, std::int64_t first, MultilevelWork<Lanes>& outer,
-                RotationJacobians<T>& frames)
-      : Base(call, work, scratch, team, first, outer), frames_(frames) {}
+                NewtonWork<T>& kept)
+      : Base(call, work, scratch, team, first, outer), kept_(kept) {}
 
   void rollout() { this->take_steps(*this); }
 
-  // One iteration is one of conjugate gradients, or a further trial.
+  // One iteration is one of conjugate gradients, or one of Jacobi's. A trial of a shorter step is none.
   void minimise() {
+    LineSearch& search = search_[0];
     bool moved = true;
     for (int k = 0;; ++k) {
       this->evaluate(k);
       this->accept_or_reject(k);
-      if (used_[0] >= set_.iterations) break;
+      const bool shortens = !search.accepted && !search.jacobi && !search.plain_jacobi;
+      if (used_[0] >= set_.iterations && !shortens) break;
       this->update_pairs(k);
       if (this->finished()) break;
-      moved = moved || search_[0].accepted;
-      if (!search_[0].jacobi && moved) {
+      moved = moved || search.accepted;
+      if (!search.jacobi && moved) {
         solve();
         moved = false;
       }
       this->next_trial();
+      used_[0] -= shortens ? 1 : 0;
     }
     this->keep_best();
   }
@@ -54,12 +57,12 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
   void solve() {
     each_vertex([&](std::int64_t i) {
       w_.u[i] = o_.iterate[i];
-      kept()[i] = w_.before[i];
+      before()[i] = w_.before[i];
     });
-    sweep_.run(0, Elements{KeepFrames<T>{frames_}, NoStencils{}},
+    sweep_.run(0, Elements{KeepFrames<T>{kept_.frames}, KeepHessians<T>{kept_.hessians}},
                [](std::int64_t, const Value&, Sum&) {});
     find_blocks();
-    if (this->has_space_) this->make_space();
+    if (this->has_space_) this->make_space(kept_.hessians);
     each_vertex([&](std::int64_t i) {
       rest()[i] = moving(i, o_.residual[i]);
       o_.direction[i] = along()[i] = none_;
@@ -68,9 +71,10 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
     // the trial that follows counts, too
     used_[0] += spent > 0 ? spent - 1 : 0;
     each_vertex([&](std::int64_t i) {
-      w_.before[i] = kept()[i];
+      w_.before[i] = before()[i];
       image()[i] = this->trial_vertex(vertex(i), i).completed(o_.direction[i]);
     });
+    search_[0].renewed();
     search_[0].descends(product(o_.residual, image()));
   }
 
@@ -138,7 +142,7 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
   void multiply(const Value* field) {
     each_vertex([&](std::int64_t i) { w_.before[i] = field[i]; });
     sweep_.template run<2>(
-        0, Elements{PositiveProduct<T>{frames_}, PositiveStencils{}},
+        0, Elements{PositiveProduct<T>{kept_.frames}, HessianProduct<T>{kept_.hessians}},
         [&](std::int64_t i, const Value& force, Sum&) {
           image()[i] =
               moves(i) ? moving(i, multiply_add(w_.inertia[i], w_.before[i], force)) : none_;
@@ -148,7 +152,7 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
   // The inverses of D, column by column.
   void find_blocks() {
     for (int axis = 0; axis < 3; ++axis) {
-      sweep_.run(0, Elements{BlockColumn<T>{frames_, axis}, StencilBlockColumn{axis}},
+      sweep_.run(0, Elements{BlockColumn<T>{kept_.frames, axis}, HessianBlocks<T>{kept_.hessians, axis}},
                  [&](std::int64_t i, const Value& force, Sum&) { o_.y[axis][i] = force; });
     }
     each_vertex([&](std::int64_t i) {
@@ -204,13 +208,13 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
   Value* rest() const { return o_.s[0]; }
   Value* image() const { return o_.s[1]; }
   Value* along() const { return o_.s[2]; }
-  Value* kept() const { return o_.s[3]; }  // the iterate before
+  Value* before() const { return o_.s[3]; }  // the iterate before
   Value* solution() const { return o_.s[4]; }
   Value* left() const { return o_.s[5]; }
   Value* step() const { return o_.s[6]; }
   Value* added() const { return o_.s[7]; }
 
-  RotationJacobians<T>& frames_;
+  NewtonWork<T>& kept_;
 };
 
 }  // namespace pd::inline PD_TARGET

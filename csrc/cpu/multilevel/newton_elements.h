@@ -1,7 +1,9 @@
-// The positive part of every element's Hessian, for solver Newton: products with directions, and blocks of its diagonal.
+// The positive part of every tetrahedron's Hessian, for solver Newton: products with directions, and blocks of its diagonal.
 #pragma once
 #include "cpu/adjoint/rotation_jacobians.h"
-#include "cpu/multilevel/piece_elements.h"
+#include "cpu/multilevel/stencil_hessians.h"
+#include "elements/solid.h"
+#include "solver/multilevel/pieces.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -116,85 +118,38 @@ struct BlockColumn {
   template <int N, class Elements>
   PD_HD void run(const Elements& elements) const {
     using R = typename Elements::R;
-    const R none(T(0)), one(T(1)), n(T(4));
+    const R none(T(0)), one(T(1)), half(T(0.5));
     const Vec3<R> unit = {axis == 0 ? one : none, axis == 1 ? one : none, axis == 2 ? one : none};
     for (int s = 0; s < N; ++s) {
       const RotationJacobian<R> kept = frames.get(elements.part(s));
-      Vec3<R> own[4];
+      const R weight = R(T(4)) * elements.weight(s);
+      R trace = none;
+      if constexpr (Grouped<Elements>)
+        trace = R(T(4)) * (frames.curvature(elements.part(s)) * elements.pressure(s));
+      Vec3<R> gradient[4], own[4];
+      shape_gradients(elements.rest(s), gradient);
       for (int c = 0; c < 4; ++c) {
-        Vec3<R> dx[4], g[4];
-        for (int a = 0; a < 4; ++a) dx[a] = a == c ? unit : Vec3<R>{none, none, none};
-        const Mat3<R> df = deformation_gradient(dx, elements.rest(s));
-        R change = none;
-        if constexpr (Grouped<Elements>)
-          change = frames.curvature(elements.part(s)) *
-                   (elements.pressure(s) * frobenius(transpose(kept.rotation), df));
-        corner_forces(positive_stress(kept, df, elements.weight(s), change), elements.rest(s), g);
-        own[c] = n * g[c];
+        // dF R^T = unit h^T
+        const Vec3<R> h = gradient[c] * kept.rotation, axial = cross(h, unit);
+        Vec3<R> twist = dot(kept.inverse.row[0], axial) * kept.inverse.row[0];
+        for (int k = 1; k < 3; ++k)
+          twist = multiply_add(dot(kept.inverse.row[k], axial), kept.inverse.row[k], twist);
+        const R along = dot(h, unit), square = half * dot(h, h);
+        const Vec3<R> strained = multiply_add(half * along, h, square * unit) + cross(twist, h);
+        own[c] = multiply_add(trace * along, h, weight * strained);
       }
       elements.add(s, own);
     }
   }
 };
 
-// Forces of stencils on their corners as these move by dx.
-template <class Kind, class R, class Own>
-PD_HD void positive_forces(const R (&second)[3 * Kind::dims][3 * Kind::dims], const Own& own,
-                           const Vec3<R> (&dx)[Kind::corners], Vec3<R> (&force)[Kind::corners]) {
-  Vec3<R> df[Kind::dims], dp[Kind::dims];
-  deform<Kind>(dx, own.g, df);
-  const auto row = [&](int r) {
-    R sum(scalar_of<R>(0));
-    for (int j = 0; j < Kind::dims; ++j) {
-      sum = multiply_add(second[r][3 * j], df[j].x, sum);
-      sum = multiply_add(second[r][3 * j + 1], df[j].y, sum);
-      sum = multiply_add(second[r][3 * j + 2], df[j].z, sum);
-    }
-    return sum;
-  };
-  for (int j = 0; j < Kind::dims; ++j) dp[j] = {row(3 * j), row(3 * j + 1), row(3 * j + 2)};
-  stencil_forces<Kind>(dp, own.g, force);
-}
+// What is kept of an iterate.
+template <class T>
+struct NewtonWork {
+  RotationJacobians<T> frames;  // of tetrahedra: R^T and the twists
+  StencilHessians<T> hessians;
 
-struct PositiveStencils {
-  template <class Kind, class Stencils>
-  PD_HD void run(const Stencils& stencils) const {
-    using R = typename Stencils::R;
-    const StencilNumbers<Kind, Stencils> own(stencils);
-    Vec3<R> x[Kind::corners], force[Kind::corners], f[Kind::dims];
-    R second[3 * Kind::dims][3 * Kind::dims];
-    stencils.corners(0, x);
-    deform<Kind>(x, own.g, f);
-    positive_second_derivative<Kind>(f, own, second);
-    stencils.corners(1, x);
-    positive_forces<Kind>(second, own, x, force);
-    stencils.add(force);
-  }
-};
-
-struct StencilBlockColumn {
-  int axis;
-
-  template <class Kind, class Stencils>
-  PD_HD void run(const Stencils& stencils) const {
-    using R = typename Stencils::R;
-    using T = scalar_of<R>;
-    constexpr int n = Kind::corners;
-    const R none(T(0)), one(T(1));
-    const Vec3<R> unit = {axis == 0 ? one : none, axis == 1 ? one : none, axis == 2 ? one : none};
-    const StencilNumbers<Kind, Stencils> own(stencils);
-    Vec3<R> x[n], column[n], force[n], f[Kind::dims];
-    R second[3 * Kind::dims][3 * Kind::dims];
-    stencils.corners(0, x);
-    deform<Kind>(x, own.g, f);
-    positive_second_derivative<Kind>(f, own, second);
-    for (int c = 0; c < n; ++c) {
-      for (int a = 0; a < n; ++a) x[a] = a == c ? unit : Vec3<R>{none, none, none};
-      positive_forces<Kind>(second, own, x, force);
-      column[c] = R(T(n)) * force[c];
-    }
-    stencils.add(column);
-  }
+  NewtonWork(const Plan<T>& plan, bool tension) : frames(plan, tension), hessians(plan) {}
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -249,15 +249,15 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
     return made_[lane] && (mismatch_[lane].has_outliers || pieces_.is_held(lane));
   }
 
-  // Makes it at the iterates of all lanes.
-  void make_space() {
+  // Makes the coarse space at the iterates of all lanes, where `kept` was.
+  void make_space(const StencilHessians<T>& kept) {
     bool all[width];
     double scales[width];
     for (int lane = 0; lane < width; ++lane) {
       all[lane] = made_[lane] = true;
       scales[lane] = search_[lane].scale;
     }
-    pieces_.make(o_.iterate, all, scales);
+    pieces_.make(o_.iterate, all, scales, &kept);
     if constexpr (HasContacts) pieces_.hold(o_.free, all, scales);
     uses_space_ = true;
   }

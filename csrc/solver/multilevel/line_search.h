@@ -153,6 +153,12 @@ struct LineSearch {
     slow = 0;
   }
 
+  // The next direction is a new one of Newton's method: its full step comes first.
+  PD_HD void renewed() {
+    step_length = 1;
+    reductions = 0;
+  }
+
   // Whether the slope g.d of a direction is negative. If not, the secant pairs do not hold here.
   PD_HD bool descends(double derivative) {
     slope = derivative;
