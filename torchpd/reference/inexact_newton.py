@@ -24,7 +24,7 @@ from .solvers import Observer, _descend
 __all__ = ["NewtonModel", "inexact_newton"]
 
 Array = NDArray[np.float64]
-FORCING = 0.1  # share of |grad E| that conjugate gradients leave
+FORCING = 0.3  # share of |grad E| that conjugate gradients leave
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def inexact_newton(
 ) -> Array:
     """The displacement [V, 3] m after so many iterations of conjugate gradients in all, in a step without contact.
 
-    A Newton iterate ends them where they leave a tenth of |grad E|. A step that does not lower E is halved.
+    A Newton iterate ends them where they leave three tenths of |grad E|. A step that does not lower E is halved.
 
     Args:
         problem: the step.

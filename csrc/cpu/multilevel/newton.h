@@ -10,7 +10,7 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr double newton_forcing = 0.1;  // share of the residual that conjugate gradients leave
+constexpr double newton_forcing = 0.3;  // share of the residual that conjugate gradients leave
 
 template <class T, bool HasContacts>
 class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
@@ -36,6 +36,7 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
     bool moved = true;
     for (int k = 0;; ++k) {
       this->evaluate(k);
+      if constexpr (HasContacts) search.overshoots = overshoots();
       this->accept_or_reject(k);
       const bool shortens = !search.accepted && !search.jacobi && !search.plain_jacobi;
       if (used_[0] >= set_.iterations && !shortens) break;
@@ -53,6 +54,14 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
   }
 
  private:
+  // Whether the residual along the direction has more than turned round at the trial. Friction changes with the normal
+  // forces, and no energy holds that: without this test full steps diverge from coefficients of about a half on.
+  bool overshoots() {
+    const LineSearch& search = search_[0];
+    if (!search.friction || !search.known || search.jacobi || search.plain_jacobi) return false;
+    return product(o_.trial_residual, image()) < -search.slope;
+  }
+
   // The direction at the iterate.
   void solve() {
     each_vertex([&](std::int64_t i) {
