@@ -99,8 +99,8 @@ struct Triangle {
     const NearestFrame<R> frame(f[0], f[1]);
     const Vec3<R> axes[2] = {frame.first, frame.second}, normal = cross(frame.first, frame.second);
     const R s00 = dot(axes[0], f[0]), s01 = dot(axes[0], f[1]), s11 = dot(axes[1], f[1]);
-    const R both = s00 + s11, linear = p[1] * (dot(axes[0], f[0] - axes[0]) +
-                                               dot(axes[1], f[1] - axes[1]));
+    const R both = s00 + s11,
+            linear = p[1] * (dot(axes[0], f[0] - axes[0]) + dot(axes[1], f[1] - axes[1]));
     const auto capped = p[0] < linear;
     const R bulk = select(capped, none, p[1]), k = select(capped, none, p[0] - linear);
     const auto softened = [&](const R& stretch) {

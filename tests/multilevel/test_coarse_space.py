@@ -10,7 +10,6 @@ import torch
 from cases import Case, box, contact_block, hard_start, slivers
 from multilevel_cases import Tables, converged, irregular, pieces_of, slabs, swing, twist
 from runs import arguments_of, displacement, simulator, state_of
-from scipy.sparse import csr_array
 
 import torchpd as pd
 from torchpd.plan import Plan

@@ -71,7 +71,7 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
     sweep_.run(0, Elements{KeepFrames<T>{kept_.frames}, KeepHessians<T>{kept_.hessians}},
                [](std::int64_t, const Value&, Sum&) {});
     find_blocks();
-    if (this->has_space_) this->make_space(kept_.hessians);
+    if (this->has_space_) make_space();
     each_vertex([&](std::int64_t i) {
       rest()[i] = moving(i, o_.residual[i]);
       o_.direction[i] = along()[i] = none_;
@@ -85,6 +85,15 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
     });
     search_[0].renewed();
     search_[0].descends(product(o_.residual, image()));
+  }
+
+  // Makes the coarse space at the iterate.
+  void make_space() {
+    const bool all[1] = {true};
+    const double scales[1] = {search_[0].scale};
+    this->made_[0] = this->uses_space_ = true;
+    this->pieces_.make(o_.iterate, all, scales, &kept_.hessians);
+    if constexpr (HasContacts) this->pieces_.hold(o_.free, all, scales);
   }
 
   // Returns how many there were.
@@ -161,8 +170,9 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
   // The inverses of D, column by column.
   void find_blocks() {
     for (int axis = 0; axis < 3; ++axis) {
-      sweep_.run(0, Elements{BlockColumn<T>{kept_.frames, axis}, HessianBlocks<T>{kept_.hessians, axis}},
-                 [&](std::int64_t i, const Value& force, Sum&) { o_.y[axis][i] = force; });
+      sweep_.run(
+          0, Elements{BlockColumn<T>{kept_.frames, axis}, HessianBlocks<T>{kept_.hessians, axis}},
+          [&](std::int64_t i, const Value& force, Sum&) { o_.y[axis][i] = force; });
     }
     each_vertex([&](std::int64_t i) {
       Mat3<T> inverse = {};

@@ -249,19 +249,6 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
     return made_[lane] && (mismatch_[lane].has_outliers || pieces_.is_held(lane));
   }
 
-  // Makes the coarse space at the iterates of all lanes, where `kept` was.
-  void make_space(const StencilHessians<T>& kept) {
-    bool all[width];
-    double scales[width];
-    for (int lane = 0; lane < width; ++lane) {
-      all[lane] = made_[lane] = true;
-      scales[lane] = search_[lane].scale;
-    }
-    pieces_.make(o_.iterate, all, scales, &kept);
-    if constexpr (HasContacts) pieces_.hold(o_.free, all, scales);
-    uses_space_ = true;
-  }
-
   // Makes the coarse space of the lanes that need it at iteration k, at their iterates.
   void find_space(int k) {
     bool asks[width], some = false;
