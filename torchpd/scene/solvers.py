@@ -194,7 +194,7 @@ class Newton:
     `Multilevel` with a coarse space made at every iterate, between smoothing steps with the Hessian.
 
     `iterations` and `Info.iterations` count iterations of conjugate gradients; `Info.restarts` counts steps that were
-    shortened. An iteration costs two to four times as much as one of `Multilevel`. Contacts and the preparation of M
+    shortened. An iteration costs four to seven times as much as one of `Multilevel`. Contacts and the preparation of M
     are those of `Multilevel`.
     """
 
