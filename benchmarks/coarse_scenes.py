@@ -1,26 +1,29 @@
-"""Scenes of the coarse correction: bodies that fly, land, slide, tip, roll, hang and are gripped.
+"""Errors of the coarse correction: bodies that fly, land, slide, tip, roll, hang and are gripped.
 
-`python benchmarks/coarse_scenes.py 16 1e5 1e7` prints the errors of a course after 16 iterations a step, with
-corrections before and after them, with further ones after every fourth, and with these by pieces of bodies.
+`python benchmarks/coarse_scenes.py 8 16 64 --youngs 1e5 1e7 --out FILE` measures what so many iterations a step leave
+of the converged course, in float64 and float32.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from machine import describe_run, write_result
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import torchpd as pd
 from torchpd.reference import StepProblem, step_problem
 from torchpd.reference.coarse_step import coarse_chebyshev
-from torchpd.reference.pieces import cut
 
 Array = NDArray[np.float64]
+Record = dict[str, Any]
 Solve = Callable[[StepProblem], Array]
 
 H = 1.0 / 60.0
@@ -209,23 +212,43 @@ def scenes(youngs: float, cells: int = 4) -> dict[str, Course]:
     return out
 
 
-def main(iterations: int, stiffness: list[float]) -> None:
-    print(f"{'scene':26s}{'youngs':>8s}{'both ends':>12s}{'every 4th':>12s}{'pieces':>12s}")
-    for youngs in stiffness:
+def summary(rows: list[Record]) -> dict[str, str]:
+    """Geometric mean and worst of the scenes in float64, by stiffness and iterations."""
+    out = {}
+    for youngs, count in sorted({(row["youngs"], row["iterations"]) for row in rows}):
+        of = [r["float64"] for r in rows if (r["youngs"], r["iterations"]) == (youngs, count)]
+        out[f"{youngs:g} Pa, {count} iterations"] = f"{np.exp(np.mean(np.log(of))):.2g}, worst {max(of):.2g}"
+    return out
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("iterations", type=int, nargs="*", default=[8, 16, 64], help="of a step (8 16 64)")
+    parser.add_argument("--youngs", type=float, nargs="+", default=[1e5, 1e6, 1e7], help="Pa (1e5 1e6 1e7)")
+    parser.add_argument("--scenes", nargs="+", help="names of scenes (all)")
+    parser.add_argument("--out", type=Path, help="output file (JSON)")
+    options = parser.parse_args(words)
+    torch.set_num_threads(1)
+    rows: list[Record] = []
+    for youngs in options.youngs:
         for name, chosen in scenes(youngs).items():
+            if options.scenes and name not in options.scenes:
+                continue
             exact = chosen.converged()
-            pieces = cut(chosen.problem(0, chosen.positions, chosen.velocities), PIECE)
-            runs = [
-                chosen.run(
-                    lambda problem, every=every, of=of: coarse_chebyshev(
-                        problem, iterations=iterations, every=every, pieces=of
-                    )
-                )
-                for every, of in ((0, None), (4, None), (4, pieces))
-            ]
-            errors = "".join(f"{error(chosen, run, exact):12.1e}" for run in runs)
-            print(f"{name:26s}{youngs:8.0e}{errors}", flush=True)
+            for count in options.iterations:
+                errors = {
+                    str(dtype).removeprefix("torch."): error(chosen, chosen.library(count, dtype), exact)
+                    for dtype in (torch.float64, torch.float32)
+                }
+                rows.append({"scene": name, "youngs": youngs, "iterations": count, **errors})
+            cells = "".join(f"{row['float64']:10.1e}" for row in rows[-len(options.iterations) :])
+            print(f"{name:26s}{youngs:8.0e}{cells}", flush=True)
+    found = summary(rows)
+    print("\n".join(f"{of}: {text}" for of, text in found.items()))
+    if options.out:
+        run = describe_run(torch.device("cpu"), 1)
+        write_result(options.out, {"schema": 1, **run, "summary": found, "rows": rows})
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), [float(word) for word in sys.argv[2:]])
+    main()

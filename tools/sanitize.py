@@ -130,8 +130,9 @@ def adjoint(sim: pd.Simulator, batch: int) -> None:
     x, plan, h = sim.rest_state(batch).positions, list(sim.plan.arrays), sim.time_step
     d, error = 0.01 * x, torch.zeros(batch, dtype=torch.float64, device=x.device)
     material = [array.detach() for array in sim.material()]
-    names = [row.name for row in MATERIAL_TABLE]
-    freed = [t[..., :0, :] if name in ("planes", "spheres") else t for name, t in zip(names, material, strict=True)]
+    # a scene without further effects has only the first rows
+    rows = zip(MATERIAL_TABLE, material, strict=False)
+    freed = [t[..., :0, :] if row.name in ("planes", "spheres") else t for row, t in rows]
     for arrays, forces in ((material, d), (material, None), (freed, None)):
         right, _, _, *held = ops.adjoint_system(d, d, x + d, x, d, forces, arrays, plan, time_step=h)
         ops.contact_gradients(d, d, d, d, x + d, x, d, forces, arrays, plan, time_step=h)

@@ -125,7 +125,7 @@ def test_a_body_at_rest_has_no_error() -> None:
 
 def test_what_few_iterations_more_than_solve_is_watched_too() -> None:
     """The chosen iterations err by rounding alone; the most that exceed the bound calibrate the residual."""
-    sim = bar(youngs=1e3)
+    sim = bar(youngs=1e2)
     state = swinging(sim)
     result = sim.tune(state, error=1e-2, candidates=[pd.Multilevel()])
     assert result.studied_error < 1e-6

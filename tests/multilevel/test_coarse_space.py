@@ -77,7 +77,7 @@ def test_stiff_slabs_in_soft_surroundings() -> None:
     assert np.all(np.array(counts(slabs())) <= [20, 25, 30])
 
 
-@pytest.mark.parametrize(("kind", "contrast"), [("slabs", 1e4), ("held slabs", 1e4), ("cubes", 1e2)])
+@pytest.mark.parametrize(("kind", "contrast"), [("slabs", 1e4), ("held slabs", 1e4), ("cubes", 1e2), ("cubes", 1e4)])
 def test_contrast_of_stiffness(kind: str, contrast: float) -> None:
     """A soft beam held at x = 0, thrown down, with stiff slabs or cubes of one cell."""
     mesh = pd.shapes.box((1.0, 0.2, 0.2), (20, 4, 4))

@@ -34,6 +34,19 @@ def test_eigenvalues_on_uniform_boxes(cells: int, youngs: float) -> None:
     assert low >= 0.3
 
 
+@pytest.mark.parametrize("contrast", [1e2, 1e4, 1e6])
+def test_eigenvalues_with_stiff_grains(contrast: float) -> None:
+    """40 cubes of one cell, of which aggregates of 30 vertices leave most without a node of their own: 1 / contrast."""
+    mesh = pd.TetMesh(*box((1.0, 0.2, 0.2), (30, 6, 6)))
+    cell = np.floor(30.0 * mesh.vertices[mesh.tets].mean(axis=1)).astype(int)
+    body = pd.Solid(mesh, np.where((cell % 3 == 1).all(axis=1), 1e4 * contrast, 1e4), density=1000.0)
+    scene = pd.Scene(body, pd.Pin(body, mesh.vertices[:, 0] == 0.0))
+    case = Case(scene, mesh.vertices, 0.0 * mesh.vertices, 1.0 / 30.0)
+    low, high = spectrum_of(prepared(case), case)
+    assert high <= 1.01
+    assert low >= 0.3
+
+
 @pytest.mark.parametrize("name", ["beam", "slivers", "bodies", "direct"])
 def test_op_is_the_cycle_of_its_tables(name: str, dtype: torch.dtype) -> None:
     case = {"beam": lambda: beam(1e6), "slivers": slivers, "bodies": many_bodies, "direct": slivers}[name]()

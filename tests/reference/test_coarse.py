@@ -251,6 +251,9 @@ def test_pins_leave_turns(held: list[int], free: int) -> None:
     lengths = [np.linalg.norm(y[:, None] - y[None], axis=2) for y in (x, x + moved)]
     np.testing.assert_allclose(*lengths, atol=1e-14)
     assert np.abs(moved[held]).max(initial=0.0) == 0.0
+    # however far other vertices have gone
+    far = np.random.default_rng(0).standard_normal(x.shape) * np.where(problem.free, 1e9, 0.0)[:, None]
+    assert RigidMotions(problem, far, (np.arange(len(x)),)).modes.shape[2] == free
 
 
 def test_a_released_pin_is_free_and_a_grasped_vertex_is_held() -> None:

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 PASSES = 1024  # states at which Phi is looked at
-ONE_POINT = 1e-6  # of a body's size and distance from the origin, which float32 rounds: pins so near lie at a point
+ONE_POINT = 1e-6  # of the distance of pins from the origin, which float32 rounds: so near they lie at a point
 ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
 STILL = 1e-7  # of the size of a body: a step that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
@@ -129,11 +129,8 @@ class RigidMotions(Motions):
         centre = y[~free].mean(axis=0)
         arms = y[~free] - centre
         apart, axes = np.linalg.eigh(arms.T @ arms / len(arms))
-        weight = np.where(free, self.problem.weight[body], 0.0)[:, None]
-        total = float(weight.sum()) or 1.0
-        square = float((weight * (y - (weight * y).sum(axis=0) / total) ** 2).sum() / total)
         turns = axes
-        if apart[2] > ONE_POINT**2 * (square + float(centre @ centre)):
+        if apart[2] > ONE_POINT**2 * float(centre @ centre):
             turns = axes[:, 2:] if apart[1] <= ONE_LINE**2 * apart[2] else axes[:, :0]
         return centre, np.concatenate([np.zeros_like(turns), turns])
 

@@ -36,6 +36,7 @@ SWEEPS = 6  # of Lloyd's method
 BLEND = 2  # sweeps that blend the weights of pieces
 DAMPING = 2.0 / 3.0  # of these Jacobi sweeps
 WEAKEST = 0.01  # relative strength of a coupling: an edge is at most 100 times its distance long
+CUT_OFF = 3.0  # a vertex is so many times as far from its centre as half of the vertices would be by strong edges
 RANK = 1e-6  # relative singular value below which the vertices of a piece do not show a twist
 
 
@@ -53,6 +54,9 @@ class Pieces:
 
 def cut(problem: Objective, size: float | None = None, most: int = MOST, blend: int = BLEND) -> Pieces:
     """Cut every component into pieces of about `size` vertices, and at most `most` pieces.
+
+    Parts that weak couplings cut off from every centre, such as stiff grains in soft surroundings, are pieces of their
+    own as long as there are fewer than `most`.
 
     Lloyd's method, with distances along the couplings of A; weak couplings are long, so that pieces follow the
     stiffness. Where pins part a component every part has a piece at least. `blend` Jacobi sweeps on the elastic part of
@@ -72,7 +76,7 @@ def cut(problem: Objective, size: float | None = None, most: int = MOST, blend: 
         if len(own):
             count_of = 2.0 * np.cbrt(len(own)) if size is None else len(own) / size
             wanted = int(np.clip(round(count_of), 1, most))
-            label = _lloyd(_lengths(problem, own), wanted)
+            label = _lloyd(*_lengths(problem, own), wanted, most)
             of[own] = count + label
             count += int(label.max()) + 1
     return Pieces(of, _blended(problem, of, count, blend))
@@ -110,8 +114,8 @@ def thinned(pieces: Pieces) -> Pieces:
     return Pieces(pieces.of, csr_array((entries, (rows, columns)), shape=weights.shape))
 
 
-def _lengths(problem: Objective, own: Index) -> csr_array:
-    """Graph of the couplings of some vertices: distance / clip(strength / upper quartile, 0.01, 1) [m]."""
+def _lengths(problem: Objective, own: Index) -> tuple[csr_array, csr_array]:
+    """Graphs of the couplings: distance / clip(strength / upper quartile, 0.01, 1), and distance alone [m]."""
     matrix = coo_array(problem.matrix[own][:, own])
     apart = (matrix.row != matrix.col) & (matrix.data != 0.0)
     row, column = matrix.row[apart], matrix.col[apart]
@@ -120,19 +124,40 @@ def _lengths(problem: Objective, own: Index) -> csr_array:
     strength = strength / (np.quantile(strength, 0.75) if len(strength) else 1.0)
     distance = np.linalg.norm(rest[row] - rest[column], axis=1)
     # an edge of length zero would be none
-    length = np.maximum(distance, 1e-9 * distance.max(initial=0.0)) / np.clip(strength, WEAKEST, 1.0)
-    return csr_array((length, (row, column)), shape=matrix.shape)
+    distance = np.maximum(distance, 1e-9 * distance.max(initial=0.0))
+    lengths = distance / np.clip(strength, WEAKEST, 1.0), distance
+    graph, plain = (csr_array((length, (row, column)), shape=matrix.shape) for length in lengths)
+    return graph, plain
 
 
-def _lloyd(graph: csr_array, wanted: int) -> Index:
+def _lloyd(graph: csr_array, plain: csr_array, wanted: int, most: int) -> Index:
     """Group of every vertex: it joins the nearest centre, then centres move to the deepest vertex of their group."""
     # neighbours in space have near numbers, so spacing the numbers spaces the centres
     centres = graph.shape[0] * (2 * np.arange(wanted) + 1) // (2 * wanted)
     for sweep in range(SWEEPS):
         label, centres = _join_nearest(graph, centres)
+        if sweep + 2 == SWEEPS:
+            label, centres = _join_cut_off(graph, plain, centres, most)
         if sweep + 1 < SWEEPS:
             centres = _deepest(graph, label, centres)
     return label
+
+
+def _join_cut_off(graph: csr_array, plain: csr_array, centres: Index, most: int) -> tuple[Index, Index]:
+    """The same with centres for parts that are cut off, the farthest first, while there are fewer than `most`."""
+    distance, before, _ = dijkstra(graph, indices=centres, min_only=True, return_predecessors=True)
+    path = np.zeros(len(distance))
+    for vertex in np.argsort(distance, kind="stable"):
+        if before[vertex] >= 0:
+            path[vertex] = path[before[vertex]] + plain[before[vertex], vertex]
+    moved = np.sort(path[path > 0.0])
+    farthest = CUT_OFF * moved[len(moved) // 2] if len(moved) else np.inf
+    cut_off = np.flatnonzero(distance > farthest)
+    for vertex in cut_off[np.argsort(-distance[cut_off], kind="stable")]:
+        if len(centres) < most and distance[vertex] > farthest:
+            centres = np.append(centres, vertex)
+            distance = np.minimum(distance, dijkstra(graph, indices=vertex))
+    return _join_nearest(graph, centres)
 
 
 def _join_nearest(graph: csr_array, centres: Index) -> tuple[Index, Index]:

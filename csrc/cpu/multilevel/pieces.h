@@ -37,7 +37,8 @@ class PiecesOfTeam {
     }
   }
 
-  // Before M: keeps Z^T q, and takes from q what M is not to see of it in lanes where the space goes `around` it.
+  // Before M: keeps Z^T q, and takes from q what M is not to see of it in lanes where the space goes `around` it. Nothing of it is
+  // left at vertices that pins hold and M does not: the force there would move the body away as a whole.
   void before(Value* q, const bool (&around)[width], bool some) const {
     restrict_to(q, [](Factors& f) -> std::vector<double>& { return f.own; });
     if (!some) return;
@@ -47,13 +48,14 @@ class PiecesOfTeam {
     each_vertex([&](std::int64_t i) { work_.field[i] = moved(i); });
     const Level<1, T> level = fine_level(plan_.levels);
     each_vertex([&](std::int64_t i) {
-      q[i] = q[i] - row_product<Real>(level, work_.field.begin(), int(i));
+      q[i] = moving(i, q[i] - row_product<Real>(level, work_.field.begin(), int(i)));
     });
   }
 
   // After it: adds what its result lacks, in other lanes Z (Hc^-1 - Ac^-1) Z^T q. q came multiplied by `scale`.
   void after(Value* z, const bool (&around)[width], bool some, const Real& scale) const {
     if (some) {
+      each_vertex([&](std::int64_t i) { z[i] = moving(i, z[i]); });
       const Level<1, T> level = fine_level(plan_.levels);
       each_vertex([&](std::int64_t i) { work_.field[i] = row_product<Real>(level, z, int(i)); });
       restrict_to(work_.field.begin(), [](Factors& f) -> std::vector<double>& { return f.image; });

@@ -282,7 +282,7 @@ class MultilevelStepper : public Stepper<Lanes, HasContacts> {
     Value *in = o_.cycle.input(), *z = o_.cycle.result();
     bool around[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
-      around[lane] = !plan_.levels.direct && (HasContacts || mismatch_[lane].has_outliers);
+      around[lane] = (HasContacts && !plan_.levels.direct) || mismatch_[lane].has_outliers;
       some = some || around[lane];
     }
     pieces_.before(in, around, some);

@@ -91,10 +91,9 @@ void sum_bodies(const Plan<typename Lanes::Scalar>& plan, Workspace<Lanes>& w) {
   each_in_a_body<Lanes>(plan, [&](int i, int g) {
     BodySums<Wide>& sums = w.body_sums[g];
     const Wide a = Lanes::widen(w.inertia[i]);
-    const Vec3<Wide> lever_arm = at(i) - sums.center;
-    add_moments(sums.rigid + S::target_offset, a, lever_arm,
+    add_moments(sums.rigid + S::target_offset, a, at(i) - sums.center,
                 widened<Wide>(Lanes::vec3(w.target[i] - w.u[i])));
-    if (plan.pins > 0) add_pin(sums.rigid + S::pins, a, lever_arm);
+    if (plan.pins > 0) add_pin(sums.rigid + S::pins, a, at(i));
   });
 }
 

@@ -21,7 +21,7 @@ class FusedRounds {
     find_motions<HasContacts>(plan, *this);
     each_slot(
         [&](int s, int vertex, const Piece& piece) { return of.corrected(s, vertex, piece.body); });
-    if (of.from != Iterate::guess) return;
+    if (!has_choice(plan, of.from)) return;
     find<Round::rises>();
     each_slot([&](int s, int, const Piece& piece) { return of.chosen(s, piece.body, piece.rise); });
   }
@@ -47,7 +47,7 @@ class FusedRounds {
     for (int n = warp; n < plan.pieces; n += warps) sum_piece<What>(plan, n, part_sums, pieces[n]);
     __syncthreads();
     for (int n = threadIdx.x; n < plan.pieces; n += blockDim.x)
-      move_piece<What>(plan, n, of.contacts.exist(), pieces[n]);
+      move_piece<What>(plan, n, of.from, of.contacts.exist(), pieces[n]);
     __syncthreads();
   }
 

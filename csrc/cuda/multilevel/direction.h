@@ -26,7 +26,7 @@ PD_DEVICE void MultilevelRunner<T, HasContacts, Threads>::precondition() {
   };
   each_vertex([&](int i) { cycle_.set(i, right_side(i)); });
   // around M where vertices are held that it leaves free
-  const bool around = made_ && !w_.plan.levels.direct && (HasContacts || outliers_.some);
+  const bool around = made_ && ((HasContacts && !w_.plan.levels.direct) || outliers_.some);
   if (made_)
     team_ = apply_pieces(pieces_, team_, around ? PiecesPart::before : PiecesPart::all,
                          cycle_.right_sides(), scale);

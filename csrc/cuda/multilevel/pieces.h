@@ -230,7 +230,7 @@ __device__ __noinline__ BlockTeam apply_pieces(PiecesControl<T>& control, BlockT
   return team;
 }
 
-// The same: takes A Z times the modes from the right-hand side of a cycle.
+// The same: takes A Z times the modes from the right-hand side of a cycle, which is 0 where a pin holds a vertex.
 template <class T>
 __device__ __noinline__ BlockTeam hide_pieces(PiecesControl<T>& control, CycleMemory<T> memory,
                                               BlockTeam team) {
@@ -241,17 +241,24 @@ __device__ __noinline__ BlockTeam hide_pieces(PiecesControl<T>& control, CycleMe
     field[i] = quad(moved_by_pieces(control, levels, i));
   team.barrier();
   DeviceCycle<T> cycle(levels, memory, team, nullptr);
-  cycle.multiply(
-      field, [&](int i, const Vec3<T>& product) { cycle.set(i, cycle.right_side(i) - product); });
+  cycle.multiply(field, [&](int i, const Vec3<T>& product) {
+    const bool moves = control.memory.arm[i].w > T(0);
+    cycle.set(i, moves ? cycle.right_side(i) - product : Vec3<T>{T(0), T(0), T(0)});
+  });
   return team;
 }
 
-// The same: A times the result of a cycle, in `field`.
+// The same: A times the result of a cycle, in `field`; the result becomes 0 where a pin holds a vertex.
 template <class T>
 __device__ __noinline__ BlockTeam multiply_result(PiecesControl<T>& control, CycleMemory<T> memory,
                                                   BlockTeam team) {
   Quad<T>* field = control.memory.field;
   DeviceCycle<T> cycle(control.plan.levels, memory, team, nullptr);
+#pragma unroll 1
+  for (int i = team.thread(); i < control.plan.levels.vertices; i += team.threads()) {
+    if (!(control.memory.arm[i].w > T(0))) cycle.set_result(i, {T(0), T(0), T(0)});
+  }
+  team.barrier();
   cycle.multiply(memory.fine.z, [&](int i, const Vec3<T>& product) { field[i] = quad(product); });
   return team;
 }

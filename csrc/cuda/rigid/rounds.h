@@ -31,6 +31,12 @@ PD_DEVICE bool has_whole_parts(const DevicePlan<T>& plan) {
   return plan.parts == plan.pieces;
 }
 
+// Whether the corrected guess follows the corrected present shape, and the one of less energy is kept.
+template <class T>
+PD_DEVICE bool has_choice(const DevicePlan<T>& plan, Iterate from) {
+  return from == Iterate::guess && plan.solid_pieces > 0;
+}
+
 // Rows of sums: of parts, and of sums of rows.
 template <class T>
 PD_HD std::int64_t count_rows(const DevicePlan<T>& plan) {
@@ -235,8 +241,7 @@ PD_DEVICE_COLD void sum_part(const Correction<T, HasContacts>& of, const DeviceP
       add_moments(sum, double(v.inertia(i)), at(i) - center, widened<double>(target_offset));
     });
     write_shares(sum, to + S::target_offset);
-    if (plan.pins > 0)
-      part.each([&](int i, int) { add_pin(held, double(v.inertia(i)), at(i) - center); });
+    if (plan.pins > 0) part.each([&](int i, int) { add_pin(held, double(v.inertia(i)), at(i)); });
     write_shares(held, to + S::pins);
   } else if constexpr (What == Round::contacts) {
     if (!piece.body.is_done()) sum_contacts(of, part, piece.body, to);
@@ -264,10 +269,13 @@ PD_DEVICE void sum_piece(const DevicePlan<T>& plan, int piece, const double* row
 
 // What follows from them, by a thread.
 template <Round What, class T>
-PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, bool has_contacts, Piece& of) {
+PD_DEVICE_COLD void move_piece(const DevicePlan<T>& plan, int piece, Iterate from,
+                               bool has_contacts, Piece& of) {
   if constexpr (What == Round::moments) {
-    of.reached = of.body.reached();
-    of.motion_before = of.body.motion();
+    if (has_choice(plan, from)) {
+      of.reached = of.body.reached();
+      of.motion_before = of.body.motion();
+    }
     of.body = CoarseBody(RigidBody(of.sum));
     for (double& sum : of.contact) sum = 0;
     while (!has_contacts && !of.body.is_done()) of.body.pass(of.contact);

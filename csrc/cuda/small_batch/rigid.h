@@ -37,7 +37,7 @@ struct SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread, FewRegister
     __syncthreads();
     for (int n = threadIdx.x; n < r.here_ * r.plan_.pieces; n += blockDim.x) {
       const WorkItem item = r.item_of(n, r.plan_.pieces);
-      move_piece<What>(r.plan_, item.at, HasContacts, r.piece(item.environment, item.at));
+      move_piece<What>(r.plan_, item.at, from, HasContacts, r.piece(item.environment, item.at));
     }
     __syncthreads();
   }
@@ -69,7 +69,7 @@ PD_DEVICE void SmallBatchRunner<T, HasContacts, HasFreePieces, OnePerThread,
     each_slot_of_a_piece([&](const WorkItem& item, int i, const Piece& piece) {
       move(i, correction(item.environment, from).corrected(i, item.at, piece.body));
     });
-    if (from != Iterate::guess) continue;
+    if (!has_choice(plan_, from)) continue;
     rounds.template find<Round::rises>();
     each_slot_of_a_piece([&](const WorkItem& item, int i, const Piece& piece) {
       move(i, correction(item.environment, from).chosen(i, piece.body, piece.rise));

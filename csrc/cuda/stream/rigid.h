@@ -27,7 +27,7 @@ class StreamRounds {
   PD_DEVICE void run() {
     find_motions<HasContacts>(w_.plan, *this);
     each_vertex([&](int i, const Piece& piece) { w_.v.set(i, of_.corrected(i, i, piece.body)); });
-    if (of_.from == Iterate::guess) {
+    if (has_choice(w_.plan, of_.from)) {
       find<Round::rises>();
       each_vertex(
           [&](int i, const Piece& piece) { w_.v.set(i, of_.chosen(i, piece.body, piece.rise)); });
@@ -51,7 +51,8 @@ class StreamRounds {
     for (int n = team_.warp(); n < w_.plan.pieces; n += team_.warps()) {
       sum_piece<What>(w_.plan, n, w_.part_sums(), w_.piece(n));
       __syncwarp();
-      if (threadIdx.x % warp_size == 0) move_piece<What>(w_.plan, n, HasContacts, w_.piece(n));
+      if (threadIdx.x % warp_size == 0)
+        move_piece<What>(w_.plan, n, of_.from, HasContacts, w_.piece(n));
     }
     team_.barrier();
   }

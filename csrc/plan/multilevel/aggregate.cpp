@@ -18,6 +18,8 @@ namespace {
 constexpr int sweeps = 6;
 constexpr double weakest =
     0.01;  // clip of the relative strength: an edge is at most 100 times its distance long
+// A vertex is cut off if it is so many times as far from its centre as half of the vertices would be by strong edges.
+constexpr double cut_off_ratio = 3;
 constexpr double never = std::numeric_limits<double>::infinity();
 
 // A vertex at a distance. Ties go to the lower number, so that all platforms agree.
@@ -92,11 +94,12 @@ class Fronts {
 
   void clear() {
     distance.assign(graph_.vertices(), never);
+    path.assign(graph_.vertices(), 0);
     label.assign(graph_.vertices(), -1);
   }
 
   void add_source(std::int32_t vertex, std::int32_t its_label) {
-    distance[vertex] = 0;
+    distance[vertex] = path[vertex] = 0;
     label[vertex] = its_label;
     queue_.push({0.0, vertex});
   }
@@ -105,17 +108,18 @@ class Fronts {
     const auto is_valid = [&](const Item& item) { return item.first <= distance[item.second]; };
     for (Item item; queue_.pop(item, is_valid);) {
       const auto [d, v] = item;
-      for (const auto& [length, u] : graph_.edges(v)) {
+      for (const auto& [length, u, apart] : graph_.edges(v)) {
         const double there = d + length;
         if (!(there < distance[u])) continue;
         distance[u] = there;
+        path[u] = path[v] + apart;
         label[u] = label[v];
         queue_.push({there, u});
       }
     }
   }
 
-  std::vector<double> distance;
+  std::vector<double> distance, path;  // from the source; the same with all edges strong
   std::vector<std::int32_t> label;
 
  private:
@@ -133,6 +137,31 @@ void join_nearest(Fronts& fronts, std::vector<std::int32_t>& centres,
     if (left_out[v] || fronts.label[v] >= 0) continue;
     fronts.add_source(std::int32_t(v), std::int32_t(centres.size()));
     centres.push_back(std::int32_t(v));
+    fronts.advance();
+  }
+}
+
+// Gives centres to parts that are cut off, the farthest first, while there are less than `most`.
+void join_cut_off(Fronts& fronts, std::vector<std::int32_t>& centres, std::int32_t most) {
+  std::vector<double> path;
+  for (std::size_t v = 0; v < fronts.label.size(); ++v) {
+    if (fronts.path[v] > 0) path.push_back(fronts.path[v]);
+  }
+  if (path.empty()) return;
+  const auto middle = path.begin() + std::ssize(path) / 2;
+  std::nth_element(path.begin(), middle, path.end());
+  const double farthest = cut_off_ratio * *middle;
+  std::vector<Item> cut_off;
+  for (std::size_t v = 0; v < fronts.label.size(); ++v) {
+    const double d = fronts.distance[v];
+    if (fronts.label[v] >= 0 && d > farthest) cut_off.emplace_back(-d, std::int32_t(v));
+  }
+  std::sort(cut_off.begin(), cut_off.end());
+  for (const auto& [unused, v] : cut_off) {
+    if (std::ssize(centres) >= most) return;
+    if (!(fronts.distance[v] > farthest)) continue;
+    fronts.add_source(v, std::int32_t(centres.size()));
+    centres.push_back(v);
     fronts.advance();
   }
 }
@@ -155,7 +184,7 @@ std::int32_t deepest(const Graph& graph, const std::vector<std::int32_t>& label,
     const auto [d, v] = queue.top();
     queue.pop();
     if (d > distance[v]) continue;
-    for (const auto& [length, u] : graph.edges(v)) {
+    for (const auto& [length, u, apart] : graph.edges(v)) {
       const double there = d + length;
       if (!is_inside(u, v) || !(there < distance[u])) continue;
       distance[u] = there;
@@ -220,8 +249,8 @@ Graph coupling_graph(std::int32_t vertices, const std::vector<Coupling>& couplin
   for (const Coupling& c : couplings) {
     const double length = c.distance / std::clamp(c.strength / quartile, weakest, 1.0);
     graph.longest = std::max(graph.longest, length);
-    graph.edge[next[c.a]++] = {length, c.b};
-    graph.edge[next[c.b]++] = {length, c.a};
+    graph.edge[next[c.a]++] = {length, c.b, float(c.distance)};
+    graph.edge[next[c.b]++] = {length, c.a, float(c.distance)};
   }
   return graph;
 }
@@ -234,7 +263,7 @@ std::int32_t connected_components(const Graph& graph, const std::vector<std::uin
 }
 
 Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_out,
-                     std::int32_t wanted, int threads) {
+                     std::int32_t wanted, std::int32_t most, int threads) {
   // neighbours in space have near numbers, so spacing the numbers spaces the centres
   std::vector<std::int32_t> candidates, centres;
   for (std::int32_t v = 0; v < graph.vertices(); ++v) {
@@ -246,6 +275,8 @@ Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_o
   Fronts fronts(graph);
   for (int sweep = 0; sweep < sweeps; ++sweep) {
     join_nearest(fronts, centres, left_out);
+    // by then the aggregates are even
+    if (sweep + 2 == sweeps) join_cut_off(fronts, centres, most);
     if (sweep + 1 < sweeps) centre(graph, fronts.label, centres, threads);
   }
   return {std::move(fronts.label), std::int32_t(centres.size())};

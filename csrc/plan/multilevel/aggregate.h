@@ -19,6 +19,7 @@ struct Graph {
   struct Edge {
     double length;
     std::int32_t neighbour;
+    float distance;  // of its ends [m]
   };
   std::vector<std::int32_t> start;
   std::vector<Edge> edge;
@@ -55,8 +56,9 @@ struct Members {
 Members members_of(const Aggregates& groups);
 
 // About `wanted` aggregates, more if the graph has more components. Six sweeps: every vertex joins the nearest centre,
-// then every centre moves to the deepest vertex of its aggregate.
+// then every centre moves to the deepest vertex of its aggregate. Parts that weak edges cut off from every centre, such
+// as stiff grains in soft surroundings, get centres of their own while there are less than `most`.
 Aggregates aggregate(const Graph& graph, const std::vector<std::uint8_t>& left_out,
-                     std::int32_t wanted, int threads);
+                     std::int32_t wanted, std::int32_t most, int threads);
 
 }  // namespace pd

@@ -179,7 +179,8 @@ Aggregates group_nodes(const BlockMatrix& matrix,
   const Graph graph = coupling_graph(
       matrix.rows, couplings(matrix, diagonal(matrix), position, weakest_coupling, threads));
   const int wanted = std::clamp(matrix.rows / 8, 1, most_coarse_nodes);
-  return limited(aggregate(graph, Mask(matrix.rows, 0), wanted, threads), most_coarse_nodes);
+  return limited(aggregate(graph, Mask(matrix.rows, 0), wanted, most_coarse_nodes, threads),
+                 most_coarse_nodes);
 }
 
 using Numbers = std::vector<std::int32_t>;
@@ -292,8 +293,8 @@ MultilevelTables build_multilevel(const MultilevelScene& scene, int threads,
   const auto free = std::int32_t(std::count(fine.held.begin(), fine.held.end(), 0));
   const bool middle = needs_middle(graph, fine.held, free);
   const std::int32_t nodes = std::max(1, free / (free < 1000 ? 15 : 30));
-  const Aggregates groups =
-      aggregate(graph, fine.held, middle ? nodes : std::min(nodes, most_coarse_nodes), threads);
+  const std::int32_t most = middle ? free : most_coarse_nodes;
+  const Aggregates groups = aggregate(graph, fine.held, std::min(nodes, most), most, threads);
   progress(0.5);
   const Tentative first = tentative(rest.candidates, 1, groups, threads);
   BlockMatrix coarse = add_fine_level(t, fine.matrix, first.prolongation, scene.folded, threads);

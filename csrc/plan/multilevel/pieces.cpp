@@ -89,7 +89,8 @@ Pieces cut_pieces(const FineMatrix& fine, const Graph& graph, const std::vector<
   const auto free = double(std::count(fine.held.begin(), fine.held.end(), 0));
   const auto wanted =
       std::int32_t(std::clamp(std::round(2 * std::cbrt(free)), 1.0, double(most_pieces)));
-  const Aggregates groups = limited(aggregate(graph, fine.held, wanted, threads), most_pieces);
+  const Aggregates groups =
+      limited(aggregate(graph, fine.held, wanted, most_pieces, threads), most_pieces);
   Shares shares = one_each(groups);
   for (int sweep = 0; sweep < blend_sweeps; ++sweep)
     shares = blended(shares, fine, inertia, groups.count);

@@ -10,7 +10,7 @@
 namespace pd::inline PD_TARGET {
 
 // In double. First those that give the mean of y; then the others, about that mean, so that far from the origin, or where
-// a stiff spring outweighs all other vertices, nothing cancels.
+// a stiff spring outweighs all other vertices, nothing cancels. Those of pins are about the origin, and know nothing of y.
 struct RigidSums {
   static constexpr int weight = 0, position = 1, target_offset = 4, second_moment = 7, turn = 13;
   static constexpr int pins = 22, pin_position = 23, pin_second_moment = 26, count = 32;
@@ -42,11 +42,10 @@ PD_HD void add_moments(W* sum, const W& a, const Vec3<W>& lever_arm, const Vec3<
   }
 }
 
-// Adds a vertex that a pin holds on its target (a = 0) to the sums from `pins` on: 1; r; r r^T, with r = `lever_arm`.
+// Adds a vertex that a pin holds at y (a = 0) to the sums from `pins` on: 1; y; y y^T.
 template <class W>
-PD_HD void add_pin(W* sum, const W& a, const Vec3<W>& lever_arm) {
-  const W at[3] = {lever_arm.x, lever_arm.y, lever_arm.z},
-          pinned = select(a > W(0.0), W(0.0), W(1.0));
+PD_HD void add_pin(W* sum, const W& a, const Vec3<W>& y) {
+  const W at[3] = {y.x, y.y, y.z}, pinned = select(a > W(0.0), W(0.0), W(1.0));
   sum[0] = sum[0] + pinned;
   int n = RigidSums::pin_second_moment - RigidSums::pins;
   for (int r = 0; r < 3; ++r) {
@@ -68,8 +67,8 @@ PD_HD Mat3<double> symmetric(const double* s) {
 
 PD_HD double trace(const Mat3<double>& a) { return (a.row[0].x + a.row[1].y) + a.row[2].z; }
 
-// Pins lie at one point that are no further apart than this share of their body's size and distance from the origin, which
-// float32 rounds; and on one line that are no further from it than this share of what they are apart.
+// Pins lie at one point that are no further apart than this share of their distance from the origin, which float32 rounds;
+// and on one line that are no further from it than this share of what they are apart.
 constexpr double one_point = 1e-6, one_line = 1e-4;
 
 // What pins leave to a body.
@@ -104,23 +103,23 @@ struct RigidBody {
     const double share = 1.0 / sum[S::pins];
     const double* position = sum + S::pin_position;
     const double mean[3] = {share * position[0], share * position[1], share * position[2]};
-    const Vec3<double> pivot = {mean[0], mean[1], mean[2]};  // from the mean of y
+    const Vec3<double> pins = {mean[0], mean[1], mean[2]};
     Mat3<double> spread = share * symmetric(sum + S::pin_second_moment);
-    for (int r = 0; r < 3; ++r) spread.row[r] = subtract_product(spread.row[r], mean[r], pivot);
+    for (int r = 0; r < 3; ++r) spread.row[r] = subtract_product(spread.row[r], mean[r], pins);
     const SignedSvd<double> svd = signed_svd(spread);
-    const Vec3<double> at_pins = center + pivot;
-    hold = !(svd.s[0] > one_point * one_point * (square + dot(at_pins, at_pins))) ? Hold::point
-           : svd.s[1] > one_line * one_line * svd.s[0]                            ? Hold::all
-                                                                                  : Hold::line;
+    hold = !(svd.s[0] > one_point * one_point * dot(pins, pins)) ? Hold::point
+           : svd.s[1] > one_line * one_line * svd.s[0]           ? Hold::all
+                                                                 : Hold::line;
     axis = {svd.u.row[0].x, svd.u.row[1].x, svd.u.row[2].x};
     // arms are longer by -pivot: sum a r = -W pivot
-    const double out[3] = {pull.x, pull.y, pull.z};
+    const Vec3<double> pivot = pins - center;
+    const double way[3] = {pivot.x, pivot.y, pivot.z}, out[3] = {pull.x, pull.y, pull.z};
     for (int r = 0; r < 3; ++r) {
-      const Vec3<double> moment = (weight * mean[r]) * pivot;
+      const Vec3<double> moment = (weight * way[r]) * pivot;
       second_moment.row[r] = second_moment.row[r] + moment;
       covariance.row[r] = subtract_product(covariance.row[r] + moment, out[r], pivot);
     }
-    center = center + pivot;
+    center = pins;
     pull = {0, 0, 0};
   }
 };

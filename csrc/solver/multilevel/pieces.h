@@ -13,6 +13,9 @@
 // H is the second derivative of each element by itself, its negative eigenvalues set to zero. The stiffness of what is stretched
 // against turns is a part of it: without it a body of 1e8 Pa with strains of a half took eight times the iterations.
 //
+// Pins that M does not know: A is P A P and M is P M P there, P zero at their vertices. So nothing that goes into M pulls at what
+// the pins leave as a whole, where M is a million times too soft.
+//
 // Contacts: with the projector P on what they leave free, P (..) P is what an iteration uses. M P alone would let a body that
 // lies on the ground go down as if there were none: (P M P) instead of (P A P)^-1. The second term has no such motions, and Hc
 // gets e^T A e, e = (I - P) dx, about what it costs the held vertices to stay behind.
