@@ -4,6 +4,7 @@
 #include "cpu/adjoint/energy_fields.h"
 #include "cpu/adjoint/system.h"
 #include "cpu/multilevel/newton.h"
+#include "cpu/multilevel/stepper.h"
 #include "cpu/step/report.h"
 #include "cpu/step/stepper.h"
 

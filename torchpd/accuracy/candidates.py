@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..estimate.solver_choice import runs
-from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Solver
+from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Newton, Solver
 from ..simulation.state import State
 from .spectral_radius import estimate_rho
 
@@ -45,6 +45,7 @@ CANDIDATES: dict[str, Candidate] = {
     "classic Chebyshev": Candidate(_classic, safe=False),
     "guarded Chebyshev": Candidate(lambda sim, state: Chebyshev(), safe=True),
     "Multilevel": Candidate(lambda sim, state: Multilevel(), safe=True),
+    "inexact Newton": Candidate(lambda sim, state: Newton(), safe=True, devices=("cpu",)),
 }
 DEFAULT = "guarded Chebyshev"  # the solver of `Simulator(scene)`
 

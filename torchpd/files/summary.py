@@ -10,7 +10,7 @@ import torch
 
 from .. import _C
 from ..common.checks import NO_VALUES
-from ..common.tables import MULTILEVEL_TABLE
+from ..common.tables import KINDS, MULTILEVEL_TABLE
 from ..estimate.convergence import FAR_TOO_FEW, forecast, has_contacts, is_bound
 from ..plan.cpu_plan import quoted_choices
 from ..plan.kernel_choice import shared_bytes
@@ -249,16 +249,26 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
     if not isinstance(solver, Multilevel | Newton):
         return real * numbers
-    # four vectors of an iteration, four of a V-cycle, and eight L-BFGS pairs
+    # four vectors of an iteration, four of a V-cycle, and eight L-BFGS pairs, whose place Newton takes for its own
     momentum = isinstance(solver, Multilevel) and solver.outer == "momentum"
     numbers += 4 * plan.vertices * (8 + (0 if momentum else 16))
     if momentum:
         return real * numbers
+    if isinstance(solver, Newton):
+        numbers += _hessian_numbers(plan)
     # the coarse space: two vectors, and two dense matrices of all pieces
     pieces = int(plan.level_sizes[7])
-    if isinstance(solver, Newton):  # rotation and twists of every tetrahedron
-        numbers += 18 * len(plan.tet_order)
     return real * (numbers + 8 * plan.vertices) + 8 * 2 * (_MODES * pieces) ** 2
+
+
+def _hessian_numbers(plan: Plan) -> int:
+    """Numbers of the Hessians of Newton: rotation, twists and tension of a tetrahedron, a triangle of a stencil's."""
+    numbers = 20 * plan.tet_order.numel()
+    if any(row.name == "stencil_block" for row in plan.table):
+        rows = [3 * kind.columns for kind in KINDS.values()]
+        each = [rows[kind] * (rows[kind] + 1) // 2 for kind in plan.stencil_block[:, 0].tolist()]
+        numbers += plan.stencil_order.shape[1] * sum(each)
+    return numbers
 
 
 def _step_bytes(sim: Stepper, real: int) -> str:

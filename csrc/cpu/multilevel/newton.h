@@ -6,21 +6,20 @@
 // not. On directions that contacts block, D has its trace, so that P H P <= P D P.
 #pragma once
 #include "cpu/multilevel/newton_elements.h"
-#include "cpu/multilevel/stepper.h"
+#include "cpu/multilevel/trials.h"
 
 namespace pd::inline PD_TARGET {
 
 constexpr double newton_forcing = 0.3;  // share of the residual that conjugate gradients leave
 
 template <class T, bool HasContacts>
-class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
+class NewtonStepper : public TrialStepper<Single<T>, HasContacts> {
   using Lanes = Single<T>;
-  using Base = MultilevelStepper<Lanes, HasContacts>;
+  using Base = TrialStepper<Lanes, HasContacts>;
   using Value = Quad<T>;
   using Sum = Sums<Lanes>;
-  static constexpr int dots = MultilevelWork<Lanes>::dots;
-  using Base::each_vertex, Base::none_, Base::o_, Base::plan_, Base::search_, Base::set_,
-      Base::sweep_, Base::team_, Base::used_, Base::vertex, Base::w_;
+  using Base::dots, Base::each_vertex, Base::none_, Base::o_, Base::plan_, Base::search_,
+      Base::set_, Base::sweep_, Base::team_, Base::used_, Base::vertex, Base::w_;
 
  public:
   NewtonStepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
@@ -40,7 +39,7 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
       this->accept_or_reject(k);
       const bool shortens = !search.accepted && !search.jacobi && !search.plain_jacobi;
       if (used_[0] >= set_.iterations && !shortens) break;
-      this->update_pairs(k);
+      move_iterate(k);
       if (this->finished()) break;
       moved = moved || search.accepted;
       if (!search.jacobi && moved) {
@@ -54,12 +53,23 @@ class NewtonStepper : public MultilevelStepper<Single<T>, HasContacts> {
   }
 
  private:
-  // Whether the residual along the direction has more than turned round at the trial. Friction changes with the normal
-  // forces, and no energy holds that: without this test full steps diverge from coefficients of about a half on.
+  // Whether the residual along the direction has turned round at the trial, so far that a shorter step would leave less.
+  // Friction changes with the normal forces, and no energy holds that: without this test full steps diverge from
+  // coefficients of about a half on.
   bool overshoots() {
     const LineSearch& search = search_[0];
     if (!search.friction || !search.known || search.jacobi || search.plain_jacobi) return false;
-    return product(o_.trial_residual, image()) < -search.slope;
+    const double after = product(o_.trial_residual, image());
+    const double shorter = search.slope + contact_step_reduction * (after - search.slope);
+    return -after > absolute(shorter);
+  }
+
+  void move_iterate(int k) {
+    this->pass([&](std::int64_t i, Value(&sum)[dots]) { this->move_vertex(k, i, sum); });
+    double total[dots];
+    this->add_up(0, total);
+    this->moved(k, 0, total);
+    team_.barrier();
   }
 
   // The direction at the iterate.
