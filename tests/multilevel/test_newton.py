@@ -12,7 +12,7 @@ import torch
 from cases import Array, Case, contact_block, on_sphere
 from mixed_scenes import CASES
 from multilevel_cases import Tables, landing, pieces_of, slabs, swing
-from newton_cases import chain, chain_displacement, falling_cloth, free_body, strip
+from newton_cases import chain, chain_displacement, falling_cloth, free_body, strip, thrown_rod
 from runs import arguments_of, displacement, simulator, state_of
 from stretch_cases import small_body
 
@@ -76,8 +76,10 @@ def test_folding_cloth_takes_few_iterations(cells: int) -> None:
     assert np.all(np.array(counted(falling_cloth(cells), [16, 40, 65])) <= [1e-1, 1e-2, 1e-3])
 
 
-@pytest.mark.parametrize(("make", "most"), [(lambda: swing(5, 1e8), [8, 14, 18]), (slabs, [23, 29, 31])])
-def test_stiff_beams_take_few_iterations(make: Callable[[], Case], most: list[int]) -> None:
+@pytest.mark.parametrize(
+    ("make", "most"), [(lambda: swing(5, 1e8), [8, 14, 18]), (slabs, [23, 29, 31]), (thrown_rod, [3, 4, 5])]
+)
+def test_stiff_bodies_take_few_iterations(make: Callable[[], Case], most: list[int]) -> None:
     assert np.all(np.array(counted(make(), most)) <= [1e-1, 1e-2, 1e-3])
 
 

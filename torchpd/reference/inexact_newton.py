@@ -1,9 +1,9 @@
 """Inexact Newton: every direction by conjugate gradients with the positive part of the Hessian.
 
-The preconditioner has two parts. P = 1.8 M + Z (Hc^-1 - 1.8 Ac^-1) Z^T is that of L-BFGS, with the space Z of pieces
-made at every Newton iterate (`reference.piece_step`). It knows A, which resists out of the plane of cloth as in it; H
-does not. So two steps of a Chebyshev iteration for H go before and after it, with 3 x 3 blocks D >= H. They damp
-[1/4, 1] of D^-1 H and cannot diverge, so that the whole is positive where P is.
+The preconditioner has two parts. P = Z Hc^-1 Z^T + 1.8 Q^T M Q with Q = I - A Z Ac^-1 Z^T is that of L-BFGS, with the
+space Z of pieces made at every Newton iterate (`reference.piece_step`). It knows A, which resists out of the plane of
+cloth as in it; H does not. So two steps of a Chebyshev iteration for H go before and after it, with 3 x 3 blocks
+D >= H. They damp [1/4, 1] of D^-1 H and cannot diverge, so that the whole is positive where P is.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def inexact_newton(
     u, used = first, 0
     energy, gradient = problem.evaluate(u)
     while used < iterations and gradient.any():
-        space = PieceCycle(problem, cycle, pieces, first=0, relaxation=relaxation)
+        space = PieceCycle(problem, cycle, pieces, first=0, relaxation=relaxation, encloses=True)
         space.observe(0, u)
         model = NewtonModel(problem, u, lambda field, space=space: relaxation * space(field))  # type: ignore[misc]
         direction, rest = np.zeros_like(u), -gradient

@@ -1,9 +1,10 @@
 // Inexact Newton on the CPU: the iterations of solver/multilevel/lbfgs.h, with directions by conjugate gradients on the
 // positive part of the Hessian. An environment at a time.
 //
-// The preconditioner is that of L-BFGS with the coarse space made at every iterate, between two steps each of a
-// Chebyshev iteration with 3 x 3 blocks D >= H: the scalar matrix A resists out of the plane of cloth as in it, H does
-// not. On directions that contacts block, D has its trace, so that P H P <= P D P.
+// The preconditioner is that of L-BFGS with the coarse space made at every iterate, between two steps each of a Chebyshev
+// iteration with 3 x 3 blocks D >= H: the scalar matrix A resists out of the plane of cloth as in it, H does not. On
+// directions that contacts block, D has its trace, so that P H P <= P D P. The space always goes around M, which makes the
+// sum positive: on a rod M + Z (Hc^-1 - Ac^-1) Z^T is not, and no direction is found.
 #pragma once
 #include "cpu/multilevel/newton_elements.h"
 #include "cpu/multilevel/trials.h"
@@ -139,7 +140,7 @@ class NewtonStepper : public TrialStepper<Single<T>, HasContacts> {
     const T scale = T(search_[0].weight(set_.relaxation, this->is_held(0)));
     each_vertex([&](std::int64_t i) { o_.cycle.input()[i] = scale * left()[i]; });
     if (this->uses_space_) {
-      this->run_with_space(scale);
+      this->run_with_space(scale, true);
     } else {
       o_.cycle.run(team_);
     }

@@ -180,12 +180,14 @@ class TrialStepper : public Stepper<Lanes, HasContacts> {
     return made_[lane] && (mismatch_[lane].has_outliers || pieces_.is_held(lane));
   }
 
-  // the cycle with the coarse space, which encloses it where contacts or outliers hold vertices that M leaves free
-  void run_with_space(const Real& scale) {
+  // the cycle with the coarse space, which encloses it where contacts or outliers hold vertices that M leaves free, or
+  // `everywhere`: then the sum is positive
+  void run_with_space(const Real& scale, bool everywhere = false) {
     Value *in = o_.cycle.input(), *z = o_.cycle.result();
     bool around[width], some = false;
     for (int lane = 0; lane < width; ++lane) {
-      around[lane] = (HasContacts && !plan_.levels.direct) || mismatch_[lane].has_outliers;
+      around[lane] =
+          everywhere || (HasContacts && !plan_.levels.direct) || mismatch_[lane].has_outliers;
       some = some || around[lane];
     }
     pieces_.before(in, around, some);

@@ -1,4 +1,4 @@
-"""Steps for tests of Newton's method: a chain with a closed form, a cloth strip, cloth that folds, a free body."""
+"""Steps for tests of Newton's method: chains and rods, a cloth strip, cloth that folds, a free body."""
 
 from __future__ import annotations
 
@@ -34,6 +34,15 @@ def chain_displacement(case: Case) -> Array:
     matrix = problem.matrix.toarray()[np.ix_(free, free)]
     u[free] = np.linalg.solve(matrix, (problem.weight[:, None] * problem.target)[free])
     return u
+
+
+def thrown_rod() -> Case:
+    """A rod of 41 vertices that is held at one end and bends: M is far from A^-1 on its pieces."""
+    vertices = np.linspace((0.0, 1.0, 0.0), (1.0, 1.0, 0.0), 41)
+    rod = pd.Rod(vertices, youngs=1e7, radius=5e-3)
+    velocities = np.zeros_like(vertices)
+    velocities[:, 1] = -2.0 * vertices[:, 0] ** 2
+    return Case(pd.Scene(rod, pd.Pin(rod, [0, 1]), pd.Gravity()), vertices, velocities, STEP)
 
 
 def strip() -> Case:
