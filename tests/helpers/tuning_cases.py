@@ -5,7 +5,7 @@ from __future__ import annotations
 import torchpd as pd
 from torchpd.accuracy.error import exact_steps, frictionless
 
-CANDIDATES = ["guarded Chebyshev", "damped Jacobi", "Multilevel", "inexact Newton"]  # of `tune`, in its order
+CANDIDATES = ["guarded Chebyshev", "damped Jacobi", "Multilevel"]  # of `tune`, in its order
 
 
 def bar(youngs: float = 1e5, time_step: float = 1 / 60, **options: object) -> pd.Simulator:

@@ -76,6 +76,16 @@ def test_folding_cloth_takes_few_iterations(cells: int) -> None:
     assert np.all(np.array(counted(falling_cloth(cells), [16, 40, 65])) <= [1e-1, 1e-2, 1e-3])
 
 
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4])
+def test_a_tolerance_holds_for_folding_cloth(tolerance: float) -> None:
+    case = falling_cloth(20)
+    solution = stepped(case, 300)
+    sim = simulator(case, torch.float64, solver=pd.Newton(), iterations=300, tolerance=tolerance)
+    after, info = sim(state_of(case, sim), return_info=True, **arguments_of(case, sim))
+    assert info.converged.all()
+    assert np.linalg.norm(displacement(sim, after) - solution) <= tolerance * np.linalg.norm(solution)
+
+
 @pytest.mark.parametrize(
     ("make", "most"), [(lambda: swing(5, 1e8), [8, 14, 18]), (slabs, [23, 29, 31]), (thrown_rod, [3, 4, 5])]
 )
@@ -108,8 +118,16 @@ def test_contacts_end_where_the_reference_does(on: str, friction: float) -> None
     assert late <= 1e-12
 
 
+@pytest.mark.parametrize("friction", [0.3, 0.5])
+def test_stiff_bodies_that_slide(friction: float) -> None:
+    """A cube of 1e7 Pa, of whose step 32 iterations of `Multilevel` leave 0.9 and 0.4."""
+    case = contact_block(pd.Ground(friction=friction), velocity=(1.0, -1.0, 0.0), youngs=1e7, cells=4)
+    solution, first = solve_with_contact(case.problem()), case.problem().first_iterate(case.start)
+    assert relative_error(stepped(case, 32), solution, first) <= 1e-4
+
+
 def test_gradients_are_those_of_multilevel() -> None:
-    """At a solved step they depend on where it ends alone. `Multilevel` takes 600 iterations to end there."""
+    """At a solved step they depend on where it ends alone. `Multilevel` takes hundreds of iterations."""
     case, found = strip(), []
     for solver, iterations in ((pd.Newton(), 100), (pd.Multilevel(), 1000)):
         sim = simulator(case, torch.float64, solver=solver, iterations=iterations)
