@@ -189,7 +189,7 @@ class Multilevel:
 class Newton:
     """Newton's method, each direction by preconditioned conjugate gradients. It runs on a CPU.
 
-    It is meant for stiff cloth, and for accurate answers there. The Hessian is the exact one of every element, without
+    It is meant for stiff cloth and rods, and for accurate answers there. The Hessian is the exact one of every element, without
     its negative eigenvalues. Conjugate gradients leave three tenths of the residual. Their preconditioner is that of
     `Multilevel` with a coarse space made at every iterate, between smoothing steps with the Hessian.
 
