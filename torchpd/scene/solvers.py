@@ -189,9 +189,9 @@ class Multilevel:
 class Newton:
     """Newton's method, each direction by preconditioned conjugate gradients. It runs on a CPU.
 
-    It is meant for stiff cloth and rods, and for accurate answers there. The Hessian is the exact one of every element, without
-    its negative eigenvalues. Conjugate gradients leave three tenths of the residual. Their preconditioner is that of
-    `Multilevel` with a coarse space made at every iterate, between smoothing steps with the Hessian.
+    It is meant for stiff cloth and rods, and for accurate answers there. The Hessian is the exact one of every element,
+    without its negative eigenvalues. Conjugate gradients leave three tenths of the residual. Their preconditioner is
+    that of `Multilevel` with a coarse space made at every iterate, between smoothing steps with the Hessian.
 
     `iterations` and `Info.iterations` count iterations of conjugate gradients; `Info.restarts` counts steps that were
     shortened. An iteration costs four to seven times as much as one of `Multilevel`. Contacts and the preparation of M
