@@ -117,7 +117,7 @@ class PieceCycle:
         if iteration == self.first or (self.remakes and self.made and self._slow >= TRIALS):
             space = PieceSpace(self.problem, thinned(self.pieces), displacement)
             noise = NOISE * np.diag(np.diag(space.matrix))
-            soft, stiff = np.linalg.inv(space.hessian_alone + noise), np.linalg.inv(space.matrix + noise)
+            soft, stiff = (np.asarray(np.linalg.inv(m + noise), float) for m in (space.hessian_alone, space.matrix))
             self._small = space, soft / self.relaxation, stiff
             self._slow, self.made = 0, self.made + 1
 
