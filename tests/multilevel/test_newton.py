@@ -168,6 +168,20 @@ def test_batches_have_the_bits_of_one() -> None:
     assert torch.equal(many, alone.expand_as(many))
 
 
+def test_threads_change_no_bits() -> None:
+    case = swing(8, 1e6, poisson=0.3)
+    sim = simulator(case, torch.float32, solver=pd.Newton(), iterations=8)
+    assert sim.plan.patches == 8
+    before, found = torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            found.append(sim(state_of(case, sim), **arguments_of(case, sim)).positions)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(*found)
+
+
 @pytest.mark.parametrize(("make", "name"), [(strip, "membrane_youngs"), (partial(free_body, poisson=0.3), "stiffness")])
 def test_environments_have_materials_of_their_own(make: Callable[[], Case], name: str) -> None:
     """Each step is solved, with M of the stiffest, and has the bits that it has alone."""
