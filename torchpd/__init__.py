@@ -19,7 +19,7 @@ from .scene.loads import Pressure, Wind
 from .scene.plastic import Plastic
 from .scene.rod import Rod
 from .scene.scene import Scene
-from .scene.solvers import Chebyshev, Jacobi, Multilevel
+from .scene.solvers import Chebyshev, Jacobi, Multilevel, Newton
 from .scene.springs import Springs
 from .scene.tie import Tie
 from .simulation.state import History, HistoryState, HistoryTrack, Info, State, Track
@@ -66,6 +66,7 @@ __all__ = [
     "MembraneStress",
     "MeshWarning",
     "Multilevel",
+    "Newton",
     "PatchBody",
     "PatchFit",
     "PatchHits",

@@ -186,6 +186,21 @@ def test_multilevel_counts_iterations_with_stiff_pieces() -> None:
         assert counts[-1] < 40
 
 
+def test_newton_is_compared_with_multilevel(tmp_path: Path) -> None:
+    out = tmp_path / "newton.json"
+    command = [sys.executable, "benchmarks/newton.py", "--scenes", "beam, 1e6 Pa", "--out", str(out)]
+    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["vertices"] == 936
+    for line, (name, solver) in zip(said, row["solvers"].items(), strict=True):
+        assert line.startswith(f"beam, 1e6 Pa, {name}, residual of x* ")
+        assert solver["residual of x*"] <= 1e-9
+        counts = [point["iterations"] for point in solver["reached"]]
+        assert len(counts) == 4
+        assert counts == sorted(counts)
+        assert counts[-1] < 40
+
+
 def test_set_up_times_every_stage(tmp_path: Path) -> None:
     out = tmp_path / "set-up.json"
     command = [sys.executable, "benchmarks/set_up.py", "--cells", "3", "--plans", "4", "--out", str(out)]
