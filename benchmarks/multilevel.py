@@ -30,6 +30,7 @@ from machine import describe_run, write_result
 from torch import Tensor
 
 import torchpd as pd
+from torchpd.common.tables import PLAN_TABLE
 
 ERRORS = (1e-2, 1e-3, 1e-4)
 OUTERS: tuple[Literal["lbfgs", "momentum"], ...] = ("lbfgs", "momentum")
