@@ -10,7 +10,7 @@ Chebyshev takes less than 60 iterations, are left out.
 
 Iterations are counted on a grid of four per octave. The first number counts that reaches 1e-3 and still does so at the
 next number of the grid and at the last. If none does, residual and energy tell whether they converge or end in another
-minimum. Measured scenes are kept.
+minimum. "auto" is measured as in `forecast.py`. Measured scenes are kept.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from forecast import judge_auto, judgement
 from machine import judge_scenes
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
@@ -102,12 +103,12 @@ def run_scene(number: int) -> Row:
     if sim.vertices > MOST or row["Chebyshev"] < SOFT:
         return {**row, "left_out": "too large" if sim.vertices > MOST else "soft"}
     auto = pd.Simulator(sim.scene, sim.time_step, solver="auto", dtype=sim.dtype, progress=False)
-    row |= {"auto": {"solver": type(auto.solver).__name__, "iterations": auto.iterations}, "steps": []}
+    row |= {"steps": []}
     ahead = pd.Simulator(sim.scene, sim.time_step, 3000, pd.Multilevel(), sim.dtype, tolerance=1e-8, progress=False)
     for _ in range(STEPS):
         exact = exact_steps(sim, state, iterations=4000)[0]
         if exact.uncertainty <= SURE and exact.moves(torch.float32):
-            row["steps"].append({**needed(sim, state, exact), "auto": errors_of(auto, state, exact).position})
+            row["steps"].append({**needed(sim, state, exact), "auto": judge_auto(auto, state, exact)})
         state = ahead(state)
     return row if row["steps"] else {**row, "left_out": "no step to compare with"}
 
@@ -145,25 +146,17 @@ def summary(rows: list[Row]) -> Row:
         group = [row for row in used if row["uneven"] == (name == "uneven")]
         steps = [(row, step) for row in group for step in row["steps"]]
         solved = [(row, step) for row, step in steps if step["needed"] is not None]
-        own = [(row, step) for row, step in solved if row["auto"]["solver"] == "Multilevel"]
         out[name] = {
             "scenes": len(group),
-            "Multilevel": sum(row["auto"]["solver"] == "Multilevel" for row in group),
             "steps": len(steps),
             f"steps that {COUNTS[-1]} iterations leave unsolved": len(steps) - len(solved),
             "of those": dict(Counter(place_of(step) for _, step in steps if step["needed"] is None)),
-            f"of the others: {AIM:g} with auto": sum(step["auto"] <= AIM for _, step in solved),
             f"of the others: within {MARGIN:g} of the forecast": sum(
                 step["needed"] <= MARGIN * row["forecast"] for row, step in solved
             ),
-            "iterations needed, mean": _mean([step["needed"] for _, step in own]),
-            "iterations of auto, mean": _mean([row["auto"]["iterations"] for row, _ in own]),
+            "auto": judgement([step["auto"] for _, step in solved]),
         }
     return out
-
-
-def _mean(numbers: list[int]) -> float | None:
-    return float(np.mean(numbers)) if numbers else None
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Benchmark of the multilevel solver: iterations to an error, set-up, memory and time, on boxes and on your own mesh.
+"""Benchmark of the multilevel solver: iterations to an error and their time, on boxes and on your own mesh.
 
 Boxes have 5r x r x r cells (1 x 0.2 x 0.2 m, six tetrahedra per cell). They are held at x = 0 and thrown with
 v_y = -10 x^2; time step 1/30 s, float64, start "inertial". The error is |x - x*| / |x_0 - x*|. x* is the solver's
@@ -11,7 +11,6 @@ processor time of one thread.
     python benchmarks/multilevel.py --cells 11 26 --youngs 1e6 1e8
     python benchmarks/multilevel.py --mesh bunny.mesh
     python benchmarks/multilevel.py --blocks 12 16
-    python benchmarks/multilevel.py --setup 32
 
 You may combine these, as results/multilevel.json does, which records its command.
 """
@@ -146,42 +145,11 @@ def measure_blocks(name: str, scene: pd.Scene, state: pd.State) -> Row:
     }  # fmt: skip
 
 
-def setup_of(cells: int) -> Row:
-    """Set-up time, memory and time per iteration in float32."""
-    scene, state = box(cells, 1e6)
-    sim = pd.Simulator(scene, 1 / 30, 16, progress=False)
-    start = time.perf_counter()
-    sim.solver = pd.Multilevel()
-    setup = time.perf_counter() - start
-    own = sum(array.numel() * array.element_size() for array in sim.plan.arrays[len(PLAN_TABLE) :])
-    tets = len(scene.values().tets)
-    print(f"{tets} tetrahedra, {sim.vertices} vertices: set-up {setup:.2f} s on {torch.get_num_threads()} threads, "
-          f"{own / 1e6:.1f} MB beside a plan of {(sim.plan.bytes - own) / 1e6:.1f} MB")  # fmt: skip
-    row = {
-        "kind": "setup", "tets": tets, "vertices": sim.vertices, "threads": torch.get_num_threads(),
-        "setup_seconds": setup, "bytes": own, "bytes_of_the_plan": sim.plan.bytes - own,
-        "milliseconds_an_iteration": {},
-    }  # fmt: skip
-    single = pd.State(state.positions.float(), state.velocities.float())
-    for solver in (pd.Multilevel(), pd.Multilevel("momentum"), pd.Chebyshev()):
-        sim.solver = solver
-        best = np.inf
-        for _ in range(4):
-            start = time.perf_counter()
-            sim(single)
-            best = min(best, time.perf_counter() - start)
-        row["milliseconds_an_iteration"][str(solver)] = 1e3 * best / sim.iterations
-        print(f"    {solver}: {1e3 * best / sim.iterations:.2f} ms an iteration")
-    return row
-
-
 def measured(arguments: argparse.Namespace) -> Iterator[Row]:
     """Yield all requested rows."""
     for path in arguments.mesh:
         yield measure(Path(path).name, *loaded(path))
-    for cells in arguments.setup:
-        yield setup_of(cells)
-    others = arguments.mesh or arguments.setup or arguments.blocks
+    others = arguments.mesh or arguments.blocks
     for cells in arguments.cells or ([] if others else [11]):
         for youngs in arguments.youngs:
             yield measure(f"box {cells}, {youngs:g} Pa", *box(cells, youngs))
@@ -197,7 +165,6 @@ def main(words: list[str]) -> None:
     parser.add_argument("--cells", type=int, nargs="+", help="r of the boxes (11 if nothing else is requested)")
     parser.add_argument("--youngs", type=float, nargs="+", default=[1e6, 1e8], help="Young's moduli of the boxes [Pa]")
     parser.add_argument("--mesh", nargs="+", default=[], help="tetrahedral meshes")
-    parser.add_argument("--setup", type=int, nargs="+", default=[], help="r of boxes to set up in float32")
     parser.add_argument("--blocks", type=int, nargs="+", default=[], help="even r >= 6 of boxes with stiff pieces")
     parser.add_argument("--contrasts", type=float, nargs="+", default=[1e2, 1e4, 1e6], help="of these pieces")
     parser.add_argument("--out", type=Path, help="output file (JSON)")

@@ -7,7 +7,8 @@ Boxes have 5r x r x r cells (1 x 0.2 x 0.2 m, six tetrahedra per cell) and are h
     gpu plan    the plan for the kernel "stream" of an H100, compiled on the CPU
     gpu levels  the plan for Multilevel on an H100, and the preconditioner with smoothing folded in
 
-Processor time of all threads together stays the same where other programs take the cores; seconds do not.
+Bytes are those of the CPU plan, and of `Multilevel` beside it. Processor time of all threads together stays the same
+where other programs take the cores; seconds do not.
 
     python benchmarks/set_up.py --cells 58 --plans 92
 """
@@ -27,6 +28,7 @@ from machine import describe_run, write_result
 
 import torchpd as pd
 from torchpd.common.gpu import H100
+from torchpd.common.tables import PLAN_TABLE
 from torchpd.plan.kernel_choice import choose_plan
 from torchpd.plan.preconditioner import precondition_plan, stored_reference
 
@@ -65,6 +67,9 @@ def set_up(cells: int, levels: bool) -> Row:
     timed(row, "gpu plan", lambda: choose_plan(values, torch.float32, H100, "stream", progress=False))
     if levels:
         timed(row, "levels", lambda: setattr(sim, "solver", pd.Multilevel()))
+        levels_bytes = sum(array.numel() * array.element_size() for array in sim.plan.arrays[len(PLAN_TABLE) :])
+        row["bytes"] = {"plan": sim.plan.bytes - levels_bytes, "levels": levels_bytes}
+        print(f"    {levels_bytes / 1e6:.1f} MB of levels beside a plan of {row['bytes']['plan'] / 1e6:.1f} MB")
         reference = stored_reference(sim.plan.arrays)
 
         def gpu_levels() -> None:

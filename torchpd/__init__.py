@@ -20,7 +20,7 @@ from .scene.loads import Pressure, Wind
 from .scene.plastic import Plastic
 from .scene.rod import Rod
 from .scene.scene import Scene
-from .scene.solvers import Chebyshev, Jacobi, Multilevel
+from .scene.solvers import Chebyshev, Jacobi, Multilevel, Newton
 from .scene.springs import Springs
 from .scene.tie import Tie
 from .simulation.state import History, HistoryState, HistoryTrack, Info, State, Track
@@ -69,6 +69,7 @@ __all__ = [
     "MembraneStress",
     "MeshWarning",
     "Multilevel",
+    "Newton",
     "PatchBody",
     "PatchFit",
     "PatchHits",

@@ -156,7 +156,7 @@ void precondition_typed(const Tensor& field, at::TensorList arrays, const Tensor
   const auto plan = Backend::template plan_view<T>(arrays, {field.device(), "field"});
   TORCH_CHECK_VALUE(plan.levels.there(),
                     "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
-                    "makes one");
+                    "or Newton() makes one");
   TORCH_CHECK_VALUE(field.size(1) == plan.vertices, "field must have the ", plan.vertices,
                     " vertices of the plan, got ", describe(field));
   const Tensor from = field.contiguous();

@@ -231,7 +231,7 @@ template <class P>
 void check_levels(const P& plan, bool wanted) {
   TORCH_CHECK_VALUE(!wanted || plan.levels.there(),
                     "plan has no multilevel preconditioner; a Simulator with solver=Multilevel() "
-                    "makes one");
+                    "or Newton() makes one");
 }
 
 #define X(name, type, width, rows, meaning) +1

@@ -4,6 +4,7 @@
 #include "cpu/adjoint/energy_fields.h"
 #include "cpu/adjoint/system.h"
 #include "cpu/contact/stepper.h"
+#include "cpu/multilevel/newton.h"
 #include "cpu/multilevel/stepper.h"
 #include "cpu/step/report.h"
 #include "cpu/step/stepper.h"
@@ -33,11 +34,17 @@ class Runner {
  public:
   Runner(const StepCall<T>& call, int threads) : call_(call) {
     if (call.settings.multilevel()) multilevel_.emplace(call, HasContacts, threads);
+    if (call.settings.newton()) newton_.emplace(call.plan, call.effects.poisson.data != nullptr);
   }
 
   void rollout(Workspace<Lanes>& work, Scratch<Lanes>& scratch, const Team& team,
                std::int64_t first) {
-    if (multilevel_) {
+    if (newton_) {
+      if constexpr (std::is_same_v<Lanes, Single<T>>) {
+        NewtonStepper<T, HasContacts>(call_, work, scratch, team, first, *multilevel_, *newton_)
+            .rollout();
+      }
+    } else if (multilevel_) {
       MultilevelStepper<Lanes, HasContacts>(call_, work, scratch, team, first, *multilevel_)
           .rollout();
     } else {
@@ -48,6 +55,7 @@ class Runner {
  private:
   const StepCall<T>& call_;
   std::optional<MultilevelWork<Lanes>> multilevel_;
+  std::optional<NewtonWork<T>> newton_;
 };
 
 template <class Lanes, bool HasContacts, class T>
@@ -96,7 +104,8 @@ template <bool HasContacts, class T>
 void step_with(const StepCall<T>& call, int threads) {
   constexpr int wide = native_width<T>;
   constexpr int narrow = wide > 4 ? wide / 2 : wide;
-  if (call.batch < least_batch) return step_singles<HasContacts>(call, threads);
+  if (call.batch < least_batch || call.settings.newton())
+    return step_singles<HasContacts>(call, threads);
   // half the lanes where full ones would leave a thread without work
   const std::int64_t groups = (call.batch + wide - 1) / wide;
   if (groups >= threads) return step_batches<Batch<T, wide>, HasContacts>(call, threads);

@@ -17,6 +17,8 @@
 // Second derivatives and derivatives by the material follow from `stress` with dual numbers. A kind whose stress has no
 // derivative in dual numbers has its own
 //   hessian(f, df, p, c, dp)     dP along dF
+// A kind may have the positive part of its second derivative in closed form
+//   positive_hessian(f, p, s)    s: [3 d][3 d], see cpu/multilevel/stencil_hessians.h
 // A kind may depend on the start of the step:
 //   memory                       how many of the numbers p, the last ones, `begin` makes
 //   begin(f, m)                  them, from F at the start

@@ -89,6 +89,44 @@ struct Triangle {
     stress[1] = multiply_add(most - tension, d1, tension * b);
   }
 
+  // The positive part of the second derivative, number 3 j + a: component a of column j of F. With V P = 2 mu F - k R
+  // and the stretches s_i it is 2 mu, and lambda on the trace, less as much of these as leaves no negative eigenvalue:
+  // 2 k / (s_1 + s_2) on the turn in the plane, and k / s_i on the turns out of it.
+  template <class R>
+  PD_HD static void positive_hessian(const Vec3<R> (&f)[2], const R (&p)[2], R (&second)[6][6]) {
+    using T = scalar_of<R>;
+    const R none(T(0)), one(T(1)), half(T(0.5));
+    const NearestFrame<R> frame(f[0], f[1]);
+    const Vec3<R> axes[2] = {frame.first, frame.second}, normal = cross(frame.first, frame.second);
+    const R s00 = dot(axes[0], f[0]), s01 = dot(axes[0], f[1]), s11 = dot(axes[1], f[1]);
+    const R both = s00 + s11,
+            linear = p[1] * (dot(axes[0], f[0] - axes[0]) + dot(axes[1], f[1] - axes[1]));
+    const auto capped = p[0] < linear;
+    const R bulk = select(capped, none, p[1]), k = select(capped, none, p[0] - linear);
+    const auto softened = [&](const R& stretch) {
+      const auto all = p[0] * stretch <= k;
+      return select(all, p[0], k / select(all, one, stretch));
+    };
+    const R turn = softened(half * both);
+    const R apart = half * (s00 - s11), spread = square_root(multiply_add(s01, s01, apart * apart));
+    const R larger = softened(half * both + spread), smaller = softened(half * both - spread);
+    const R mean = half * (larger + smaller);
+    const R slope = half * (larger - smaller) / select(none < spread, spread, one);
+    const R bend[2][2] = {{multiply_add(slope, apart, mean), slope * s01},
+                          {slope * s01, subtract_product(mean, slope, apart)}};
+    const auto number = [](const Vec3<R>& v, int a) { return a == 0 ? v.x : a == 1 ? v.y : v.z; };
+    const Vec3<R> turned[2] = {axes[1], -axes[0]};
+    for (int r = 0; r < 6; ++r) {
+      for (int c = 0; c < 6; ++c) {
+        const int j = r / 3, l = c / 3, a = r % 3, b = c % 3;
+        R sum = r == c ? p[0] : none;
+        sum = multiply_add(bulk, number(axes[j], a) * number(axes[l], b), sum);
+        sum = subtract_product(sum, half * turn, number(turned[j], a) * number(turned[l], b));
+        second[r][c] = subtract_product(sum, bend[j][l], number(normal, a) * number(normal, b));
+      }
+    }
+  }
+
   template <class R>
   PD_HD static R weight(const R (&p)[2], const R& l, const R& n) {
     const R none(scalar_of<R>(0));

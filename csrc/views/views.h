@@ -282,7 +282,14 @@ bool shares_effects(const Effects<T>& effects) {
 }
 
 // from lbfgs on, the solver is multilevel
-enum class ScheduleKind : int { jacobi = 0, classic = 1, guarded = 2, lbfgs = 3, momentum = 4 };
+enum class ScheduleKind : int {
+  jacobi = 0,
+  classic = 1,
+  guarded = 2,
+  lbfgs = 3,
+  momentum = 4,
+  newton = 5
+};
 enum class StartKind : int { velocity = 0, inertial = 1, given = 2 };
 
 struct Settings {
@@ -293,7 +300,8 @@ struct Settings {
 
   PD_HD StartKind start() const { return inertial; }
   PD_HD bool multilevel() const { return schedule >= ScheduleKind::lbfgs; }
-  // whether L-BFGS corrects the direction
+  PD_HD bool newton() const { return schedule == ScheduleKind::newton; }
+  // whether a line search takes directions of L-BFGS or Newton
   PD_HD bool learns() const { return multilevel() && schedule != ScheduleKind::momentum; }
 };
 

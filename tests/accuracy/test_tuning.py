@@ -7,6 +7,8 @@ import warnings
 
 import pytest
 import torch
+from newton_cases import thrown_rod
+from runs import simulator, state_of
 from tuning_cases import CANDIDATES, bar, swinging, worst_error
 
 import torchpd as pd
@@ -113,6 +115,22 @@ def test_stiff_beams_are_tuned() -> None:
     assert isinstance(result.solver, pd.Multilevel)
     assert result.iterations < 40
     assert worst_error(sim, swinging(sim, speed=-10.0)) <= 1e-2
+
+
+def test_rods_are_tuned_with_newton(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On them it is tried; an iteration as long as five of the others."""
+    case = thrown_rod()
+    sim = simulator(case, torch.float32)
+    state = state_of(case, sim)
+    assert list(safe_candidates(sim, state)) == [*CANDIDATES, "inexact Newton"]
+    monkeypatch.setattr(
+        tuning,
+        "_milliseconds",
+        lambda sim, start, trial: trial.iterations * (5.0 if trial.solver == pd.Newton() else 1.0),
+    )
+    result = sim.tune(state, error=1e-2)
+    assert result.attained
+    assert result.solver == pd.Newton()
 
 
 def test_a_kernel_without_multilevel_is_tuned_without_it(monkeypatch: pytest.MonkeyPatch) -> None:

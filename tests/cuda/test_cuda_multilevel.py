@@ -318,6 +318,16 @@ def test_solvers_can_be_exchanged() -> None:
         torch.ops.torchpd.step(*start, None, None, block.material(), [*block.plan.arrays, *levels], **numbers)
 
 
+def test_newton_is_refused() -> None:
+    """By the simulator, and by the op."""
+    sim, start = small(torch.float64, GPU, solver=pd.Multilevel())
+    with pytest.raises(RuntimeError, match=r"device must be the CPU for Newton.*cuda"):
+        sim.solver = pd.Newton()
+    numbers = {**sim.step_settings(inertial=False, report=False), **pd.Newton().settings()}
+    with pytest.raises(ValueError, match=r"schedule must be 0 .* on a GPU, got 5 \(newton\)"):
+        torch.ops.torchpd.step(*start, None, None, sim.material(), list(sim.plan.arrays), **numbers)
+
+
 @pytest.mark.usefixtures("most_direct")
 def test_gradients_are_those_of_the_cpu() -> None:
     case = contact_block(pd.Ground(), velocity=(0.3, -1.0, 0.0))

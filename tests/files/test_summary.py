@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from cases import Case, box
+from newton_cases import strip
 from runs import moving, same_bits, simulator
 
 import torchpd as pd
@@ -163,3 +164,10 @@ def test_workspace_of_the_multilevel_solver(outer: str, more: int) -> None:
     assert pieces == 7
     extra = workspace_bytes(sim.plan, 4, sim.solver) - workspace_bytes(sim.plan, 4, pd.Chebyshev())
     assert extra == 16 * 36 * more + (8 * 2 * (6 * pieces) ** 2 if outer == "lbfgs" else 0)
+
+
+def test_workspace_of_newton() -> None:
+    """Beside that of L-BFGS: twenty numbers of a tetrahedron; symmetric matrices of six and three rows of stencils."""
+    for case, numbers in ((bare(), 20 * 5 * 16), (strip(), (3 * 21 + 4 * 6) * 16)):
+        plan = simulator(case, torch.float32, solver=pd.Newton()).plan
+        assert workspace_bytes(plan, 4, pd.Newton()) == workspace_bytes(plan, 4, pd.Multilevel()) + 4 * numbers

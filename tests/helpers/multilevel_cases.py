@@ -17,6 +17,7 @@ import torchpd as pd
 from torchpd import _C
 from torchpd.plan import Plan
 from torchpd.plan.preconditioner import precondition_plan, stored_reference
+from torchpd.reference.pieces import Pieces
 
 SOLVERS = [pd.Multilevel(), pd.Multilevel("momentum")]
 IDS = ["lbfgs", "momentum"]
@@ -110,6 +111,18 @@ def build_levels(sim: pd.Simulator, *, folded: bool) -> dict[str, Any]:
         values.rest_positions, values.tets, [], order, stiffness, inertia,
         0, folded, torch.get_num_threads(), lambda _: None,
     )  # fmt: skip
+
+
+def pieces_of(plan: Plan) -> Pieces:
+    """The pieces in a plan, in the user's order of vertices."""
+    order, of = plan.vertex_order.numpy(), plan.piece_of.numpy().reshape(-1, 4)
+    weight = plan.piece_weight.numpy().astype(np.float64).reshape(-1, 4)
+    entries = (weight.ravel(), (np.repeat(order, 4), of.ravel()))
+    shares = csr_array(entries, shape=(len(order), int(plan.level_sizes[7])))
+    shares.eliminate_zeros()
+    main = np.empty(len(order), np.int64)
+    main[order] = np.where(weight[:, 0] > 0.0, of[:, 0], -1)
+    return Pieces(main, shares)
 
 
 class Tables:

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 import torch
 from cases import Case, box, contact_block, hard_start, slivers
-from multilevel_cases import Tables, converged, irregular, slabs, swing, twist
+from multilevel_cases import Tables, converged, irregular, pieces_of, slabs, swing, twist
 from runs import arguments_of, displacement, simulator, state_of
-from scipy.sparse import csr_array
 
 import torchpd as pd
 from torchpd.plan import Plan
 from torchpd.plan.gpu_plan import compile_device_plan, device_table
 from torchpd.plan.preconditioner import precondition_plan, stored_reference
 from torchpd.reference.piece_step import PieceCycle
-from torchpd.reference.pieces import Pieces
 from torchpd.reference.solvers import newton, preconditioned_lbfgs, relative_error, solve_with_contact
 
 pytestmark = pytest.mark.usefixtures("poisoned")
@@ -119,18 +117,6 @@ def test_cloth_has_pieces_too() -> None:
     sim = simulator(case, torch.float64, solver=pd.Multilevel(), iterations=36)
     u = displacement(sim, sim(state_of(case, sim), **arguments_of(case, sim)))
     assert relative_error(u, newton(problem, first, tolerance=1e-8), first) <= 1e-2
-
-
-def pieces_of(plan: Plan) -> Pieces:
-    """The pieces in a plan, in the user's order of vertices."""
-    order, of = plan.vertex_order.numpy(), plan.piece_of.numpy().reshape(-1, 4)
-    weight = plan.piece_weight.numpy().astype(np.float64).reshape(-1, 4)
-    entries = (weight.ravel(), (np.repeat(order, 4), of.ravel()))
-    shares = csr_array(entries, shape=(len(order), int(plan.level_sizes[7])))
-    shares.eliminate_zeros()
-    main = np.empty(len(order), np.int64)
-    main[order] = np.where(weight[:, 0] > 0.0, of[:, 0], -1)
-    return Pieces(main, shares)
 
 
 @pytest.mark.parametrize(("poisson", "iterations"), [(0.0, 12), (0.4, 8)])

@@ -104,7 +104,7 @@ def test_states_are_checked(name: str, sim: pd.Simulator) -> None:
 
 
 NUMBERS = {
-    "schedule": ((-1, 5), r"schedule must be 0 \(jacobi\), .* 3 \(lbfgs\) or 4 \(momentum\), got"),
+    "schedule": ((-1, 6), r"schedule must be 0 \(jacobi\), .* 4 \(momentum\) or 5 \(newton\), got"),
     "iterations": ((-1, 10**10), r"iterations must be 0\.\.1e9, got"),
     "time_step": ((0.0, -1.0, math.nan, math.inf), r"time_step .*finite \[s\], got"),
     "relaxation": ((0.0, 2.0, -0.1, math.nan), r"relaxation must lie in \(0, 2\), got"),

@@ -156,18 +156,15 @@ def test_beam_counts_iterations(tmp_path: Path) -> None:
 
 
 def test_multilevel_counts_iterations(tmp_path: Path) -> None:
-    """Of a box; beside it the set-up of one, and what both need is in the file."""
+    """Of a box; the file has the rows."""
     out = tmp_path / "multilevel.json"
-    words = ["--cells", "3", "--youngs", "1e6", "--setup", "3", "--out", str(out)]
+    words = ["--cells", "3", "--youngs", "1e6", "--out", str(out)]
     command = [sys.executable, "benchmarks/multilevel.py", *words]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    setup, *speeds, name, lbfgs, momentum, chebyshev = result.stdout.splitlines()
-    assert setup.startswith("810 tetrahedra, 256 vertices: set-up")
-    assert len(speeds) == 3
+    name, lbfgs, momentum, chebyshev = result.stdout.splitlines()
     written = json.loads(out.read_text())
-    assert [row["kind"] for row in written["rows"]] == ["setup", "steps"]
-    assert len(written["rows"][0]["milliseconds_an_iteration"]) == 3
-    assert [str(count) for count in written["rows"][1]["iterations"]["lbfgs"]] == lbfgs.split()[1:4]
+    assert [row["kind"] for row in written["rows"]] == ["steps"]
+    assert [str(count) for count in written["rows"][0]["iterations"]["lbfgs"]] == lbfgs.split()[1:4]
     assert name.startswith("box 3, 1e+06 Pa: 256 vertices")
     for line, outer in ((lbfgs, "lbfgs"), (momentum, "momentum")):
         counts = line.split()[1:4]
@@ -185,6 +182,21 @@ def test_multilevel_counts_iterations_with_stiff_pieces() -> None:
     for row in rows[::2]:
         # iterations to 1e-2, 1e-3 and 1e-4
         counts = [int(cell.split()[-1]) for cell in row.split(" it.")[:3]]
+        assert counts == sorted(counts)
+        assert counts[-1] < 40
+
+
+def test_newton_is_compared_with_multilevel(tmp_path: Path) -> None:
+    out = tmp_path / "newton.json"
+    command = [sys.executable, "benchmarks/newton.py", "--scenes", "beam, 1e6 Pa", "--out", str(out)]
+    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["vertices"] == 936
+    for line, (name, solver) in zip(said, row["solvers"].items(), strict=True):
+        assert line.startswith(f"beam, 1e6 Pa, {name}, residual of x* ")
+        assert solver["residual of x*"] <= 1e-9
+        counts = [point["iterations"] for point in solver["reached"]]
+        assert len(counts) == 4
         assert counts == sorted(counts)
         assert counts[-1] < 40
 
@@ -433,4 +445,5 @@ def test_a_cube_slides_or_rests_for_its_gradients() -> None:
     rows = [benchmark.training_row(2, 2, speed, torch.device("cpu"), 0.0) for speed in (3.0, 0.0)]
     assert rows[0]["slide"] >= 4.0
     assert rows[1]["slide"] == 0.0
-    assert all(row["vertices"] == 27 and 0.0 < row["forward"] < row["both"] for row in rows)
+    # which of the two takes longer depends on other programs
+    assert all(row["vertices"] == 27 and min(row["forward"], row["both"]) > 0.0 for row in rows)

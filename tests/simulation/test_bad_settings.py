@@ -57,9 +57,9 @@ def test_settings_of_a_simulator_are_checked() -> None:
         ({"tolerance": "low"}, ValueError, "tolerance .*got 'low'"),
         ({"dt": 0.01}, TypeError, r"^Simulator has no argument 'dt'; .*`time_step`"),
         (
-            {"solver": "newton"},
+            {"solver": "gauss"},
             TypeError,
-            "solver .*got 'newton'",
+            "solver .*got 'gauss'",
         ),
         ({"device": "gpu"}, RuntimeError, "gpu"),
         ({"dtype": "float32"}, ValueError, "dtype .*got 'float32'"),

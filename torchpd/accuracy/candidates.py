@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ..estimate.solver_choice import runs
-from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Solver
+from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Newton, Solver
 from ..simulation.state import State
 from .spectral_radius import estimate_rho
 
@@ -27,6 +27,7 @@ class Candidate:
     make: Callable[[Stepper, State], Solver]
     safe: bool
     devices: tuple[str, ...] = ("cpu", "cuda")  # where it runs
+    of_solids: bool = True  # whether `tune` tries it where there are solids alone
 
 
 def _classic(sim: Stepper, state: State) -> Solver:
@@ -45,12 +46,17 @@ CANDIDATES: dict[str, Candidate] = {
     "classic Chebyshev": Candidate(_classic, safe=False),
     "guarded Chebyshev": Candidate(lambda sim, state: Chebyshev(), safe=True),
     "Multilevel": Candidate(lambda sim, state: Multilevel(), safe=True),
+    # not "Newton", which is a baseline; on solids it takes three times as long as Multilevel
+    "inexact Newton": Candidate(lambda sim, state: Newton(), safe=True, devices=("cpu",), of_solids=False),
 }
 DEFAULT = "guarded Chebyshev"  # the solver of `Simulator(scene)`
 
 
 def safe_candidates(sim: Stepper, state: State) -> dict[str, Solver]:
-    """Solvers that cannot diverge and run on the simulator's device, the default first."""
-    here = {name: c for name, c in CANDIDATES.items() if c.safe and sim.device.type in c.devices}
+    """Solvers that cannot diverge, run on the simulator's device and suit its scene, the default first."""
+    others = sim.compiled.has_stencils
+    here = {
+        name: c for name, c in CANDIDATES.items() if c.safe and sim.device.type in c.devices and (c.of_solids or others)
+    }
     made = {name: here[name].make(sim, state) for name in sorted(here, key=lambda name: name != DEFAULT)}
     return {name: solver for name, solver in made.items() if runs(solver, sim.compiled)}

@@ -29,7 +29,7 @@ from ..estimate.solver_choice import runs
 from ..ops.diagonal import named_material, step_diagonal
 from ..plan.material import dims_of, fingerprint, named_arrays
 from ..scene.pins import PIN_HARD
-from ..scene.solvers import Chebyshev, Multilevel, Solver
+from ..scene.solvers import Chebyshev, Multilevel, Newton, Solver
 from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
 from ..simulation.state import State
@@ -169,9 +169,9 @@ def tune(
 
 
 def _default_candidates(sim: Stepper, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
-    """Default candidates: with friction without `Multilevel`, which may stagnate in states outside of the study."""
+    """Default candidates: with friction without `Multilevel` and `Newton`, which may stagnate outside of the study."""
     smooth = not has_friction(sim.compiled)
-    return {name: solver for name, solver in solvers.items() if smooth or not isinstance(solver, Multilevel)}
+    return {name: solver for name, solver in solvers.items() if smooth or not isinstance(solver, Multilevel | Newton)}
 
 
 # ---- the study

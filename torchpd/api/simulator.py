@@ -57,13 +57,14 @@ class Simulator(Stepper):
         iterations: most local and global steps in a time step. None: 64, or the choice of "auto". An `UnsolvedWarning`
             comes once if the default number is expected to leave an error of 0.1 or more; `print(sim)` has the
             estimate.
-        solver: `Chebyshev()` (None), `Jacobi()`, `Multilevel()`, or one of their names in lower case. "auto" chooses a
-            solver, and iterations if none are given, for an error of 1e-3: docs/solvers.md. May be set later.
+        solver: `Chebyshev()` (None), `Jacobi()`, `Multilevel()`, `Newton()`, or one of their names in lower case.
+            "auto" chooses a solver for an error of 1e-3, and if no iterations are given their limit and a tolerance:
+            docs/solvers.md. May be set later.
         dtype: torch.float32 or torch.float64. A warning comes if float32 resolves rest positions more coarsely than
             1e-4 of an edge. Positions of later states are not checked.
         tolerance: an environment stops iterating when its estimated relative displacement error falls below this; 0:
-            never. Relative to the displacement that elasticity and contacts (or gravity, if more) cause:
-            docs/limits.md.
+            never, or the choice of "auto". Relative to the displacement that elasticity and contacts (or gravity, if
+            more) cause: docs/limits.md.
         kernel: of a GPU: "block", "cluster", "grid" or "stream". "auto" takes the first that fits or, with `batch`, the
             one expected to be fastest. "benchmark" times each that fits. See docs/gpu.md. May be set later.
         batch: expected environments of a step, for which a GPU's plan, `Multilevel` and "auto" are chosen. Other

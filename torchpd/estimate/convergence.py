@@ -36,7 +36,7 @@ from ..geometry.mesh_quality import smallest_dihedral
 from ..geometry.tet_mesh import TetMesh
 from ..ops.diagonal import step_diagonal
 from ..plan.compiled import CompiledScene
-from ..scene.solvers import Chebyshev, Multilevel, Solver
+from ..scene.solvers import Chebyshev, Multilevel, Newton, Solver
 
 __all__ = [
     "Forecast",
@@ -145,7 +145,7 @@ def forecast(
     solver = compiled.solver if solver is None else solver
     spectrum = spectrum_of(compiled) if spectrum is None else spectrum
     numbers = solver.settings()
-    if spectrum is None or not numbers["weighted"]:
+    if spectrum is None or not numbers["weighted"] or isinstance(solver, Newton):
         return None
     if isinstance(solver, Multilevel) and not (has_contacts(compiled) or compiled.has_stencils):
         largest = max(len(body.mesh.vertices) for body in compiled.scene.bodies)

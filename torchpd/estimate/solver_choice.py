@@ -4,6 +4,9 @@ The choice is made when the simulator is created or moved, and by `Simulator.pre
 estimate (`forecast`) and the cost of an iteration on the device, for the batch given to the simulator. Nothing is
 timed, so the choice is reproducible. The batch of a state has no influence: an environment gives the same bits alone
 and in any batch.
+
+The estimate bounds the iterations of a step. A tolerance of half the aim ends each step: steps of one motion need
+different numbers, and no estimate made before the motion knows them.
 """
 
 from __future__ import annotations
@@ -31,13 +34,13 @@ from .convergence import (
     has_contacts,
     held_up_by,
     is_bound,
-    is_uneven,
     spectrum_of,
 )
 
 __all__ = [
     "AIM",
     "CPU_CHEBYSHEV",
+    "TOLERANCE",
     "Choice",
     "Cost",
     "choose_solver",
@@ -48,8 +51,10 @@ __all__ = [
 
 AIM = 1e-3  # relative error that "auto" sets the iterations for
 MARGIN = 1.8  # factor on the estimate: enough for 19 of 20 random scenes, and for 99 of 100 steps with an impact
-PATIENCE = 4  # further factor where a tolerance ends easy steps early: hard steps, which no estimate covers, need it
-# most iterations, times `PATIENCE` with a tolerance: float32 resolves no more, and a step must end
+PATIENCE = 4  # further factor, since the tolerance ends easy steps early: hard steps, which no estimate covers, need it
+# Tolerance of "auto". Its estimate of the error is up to twice too small in 19 of 20 steps (benchmarks/landings.py).
+TOLERANCE = AIM / 2.0
+# most iterations, times `PATIENCE`: float32 resolves no more, and a step must end
 MOST_OF_CHEBYSHEV = 10_000
 # Factor on the time of a Multilevel iteration with contacts. Resting boxes of 125 to 9,261 vertices, compared with
 # swinging ones, took 1.1 to 1.7 times as long on an H100, 1.1 to 1.4 times on the CPU.
@@ -115,22 +120,22 @@ def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solv
     """Choose the solver for a scene and device, with a reason.
 
     Chebyshev gets a relaxation of min(1.9, 2 / (1 + mu)), which is optimal for a spectrum of [mu, 1]. On smooth planes
-    the iterations of Multilevel are for an impact, a hard one for an uneven body. With a tolerance, and without
-    `iterations`, its cost is compared at the count of other steps.
+    the iterations of Multilevel are for an impact, a hard one for an uneven body. Without `iterations`, its cost is
+    compared at the count of other steps.
 
     Args:
         compiled: scene, time step, material, device and batch.
         iterations: given by the user, and kept: Chebyshev if they suffice for it, else the solver with the smaller
             error (Chebyshev with friction or spheres). None: the estimate for an error of `AIM`, times `MARGIN`, up to
-            `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`; with a tolerance `PATIENCE` times that.
+            `MOST_OF_CHEBYSHEV` or `MOST_OF_LEVELS`, times `PATIENCE`; the tolerance ends most steps long before.
     """
 
     def chosen(enough: int, why: str, most: int = MOST_OF_CHEBYSHEV) -> Choice:
         if iterations is not None:
             return Choice(iterations, False, why)
-        times, capped = PATIENCE if compiled.tolerance > 0.0 else 1, enough > most
-        why += f'; "auto" takes no more than {most * times:,}' if capped else ""
-        return Choice(min(enough, most) * times, True, why, capped)
+        capped = enough > most
+        why += f'; "auto" takes no more than {most * PATIENCE:,}' if capped else ""
+        return Choice(min(enough, most) * PATIENCE, True, why, capped)
 
     spectrum = spectrum_of(compiled)
     chebyshev: Solver = Chebyshev(relaxation=_relaxation(spectrum))
@@ -157,9 +162,9 @@ def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solv
     if iterations is None:
         count = float(levels.iterations(AIM))
         usual = LANDING_ROOTS * math.sqrt(plain.iterations(AIM))
-        if has_contacts(compiled) and compiled.tolerance > 0.0 and is_uneven(compiled) and usual < count:
+        if has_contacts(compiled) and usual < count:
             count = usual
-            both += f"; with a tolerance about {round(usual)} where no sliver or soft part lands"
+            both += f"; about {round(usual)} where no sliver or soft part lands"
         better = count * ratio < plain.iterations(AIM)
     else:
         better = iterations < _enough(plain) and levels.rate > plain.rate

@@ -36,7 +36,7 @@ from ..scene.pins import PIN_HARD
 from ..scene.plastic import Plastic
 from ..scene.rod import Rod
 from ..scene.scene import Part, Scene
-from ..scene.solvers import Chebyshev, Jacobi, Multilevel, Solver
+from ..scene.solvers import Chebyshev, Jacobi, Multilevel, Newton, Solver
 from ..scene.springs import Springs
 from ..scene.tie import Tie
 from ..version import __version__
@@ -53,7 +53,7 @@ _PARTS = (
     Solid, Cloth, Rod, Springs, Tie, Fibres, Pin, Pressure, Wind, Gravity, Ground, Sphere, Damping, Collider, Contact,
 )  # fmt: skip
 _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in _PARTS}
-_SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel)}
+_SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel, Newton)}
 _BODIES = {"body", "other", "solid"}  # fields that hold a body of the scene
 # fields that the first files of format 2 lack
 _LATER = {"poisson", "averaging", "law", "strain_limit", "limit_stiffness", "stiffness_damping", "plastic"}
@@ -275,7 +275,7 @@ def _saved(record: Record, tensors: _Tensors) -> SavedSimulation:
     if "pin_stiffness" in material:
         material.setdefault(PIN_HARD, material["pin_stiffness"].isinf())
     reference = None
-    if isinstance(settings["solver"], Multilevel) or settings["adjoint"] == "multilevel":
+    if isinstance(settings["solver"], Multilevel | Newton) or settings["adjoint"] == "multilevel":
         stiffness, inertia = (tensors[f"solver.{name}"] for name in _REFERENCE)
         reference = stiffness, inertia
     return SavedSimulation(

@@ -10,7 +10,7 @@ import torch
 
 from .. import _C
 from ..common.checks import NO_VALUES
-from ..common.tables import MULTILEVEL_TABLE
+from ..common.tables import KINDS, MULTILEVEL_TABLE
 from ..estimate.convergence import FAR_TOO_FEW, forecast, has_contacts, is_bound
 from ..plan.cpu_plan import quoted_choices
 from ..plan.kernel_choice import shared_bytes
@@ -21,7 +21,7 @@ from ..scene.fibres import Fibres
 from ..scene.part import Body
 from ..scene.rod import Rod
 from ..scene.scene import Scene
-from ..scene.solvers import Chebyshev, Multilevel, Solver
+from ..scene.solvers import Chebyshev, Multilevel, Newton, Solver
 from ..scene.springs import Springs
 from ..scene.tie import Tie
 
@@ -57,6 +57,8 @@ def _solver_line(sim: Stepper) -> str:
         name = f"Chebyshev {sim.solver.schedule}"
     if isinstance(sim.solver, Multilevel):
         name = f"Multilevel {sim.solver.outer}"
+    if isinstance(sim.solver, Newton):
+        name = "Newton"
     stop = f"at most {sim.iterations}" if sim.tolerance else f"{sim.iterations}"
     rho = f", rho {settings['rho']:g}" if settings["rho"] else ""
     diagonal = "weighted" if settings["weighted"] else "plain"
@@ -101,7 +103,7 @@ def _preconditioner_lines(sim: Stepper) -> list[str]:
     plan = sim.plan
     if not has_preconditioner(plan.arrays):
         return []
-    whose = "" if isinstance(sim.solver, Multilevel) else " of gradients"
+    whose = "" if isinstance(sim.solver, Multilevel | Newton) else " of gradients"
     _, _, nodes, _, _, below, direct, *_ = plan.level_sizes.tolist()
     steps = [f"{plan.vertices} vertices", *(f"{count} nodes" for count in (nodes, below) if count)]
     solved = "solved directly" if direct else "the last solved directly"
@@ -248,15 +250,28 @@ def workspace_bytes(plan: Plan, real: int, solver: Solver) -> int:
     """Memory of a CPU step for one environment [B], besides plan, material and states; `real` bytes a number."""
     # five vectors of four numbers, two weights, and the slots of patches
     numbers = 22 * plan.vertices + 8 * len(plan.slot_vertex)
-    if not isinstance(solver, Multilevel):
+    if not isinstance(solver, Multilevel | Newton):
         return real * numbers
-    # four vectors of an iteration, four of a V-cycle, and eight L-BFGS pairs
-    numbers += 4 * plan.vertices * (8 + (16 if solver.outer != "momentum" else 0))
-    if solver.outer == "momentum":
+    # four vectors of an iteration, four of a V-cycle, and eight L-BFGS pairs, whose place Newton takes for its own
+    momentum = isinstance(solver, Multilevel) and solver.outer == "momentum"
+    numbers += 4 * plan.vertices * (8 + (0 if momentum else 16))
+    if momentum:
         return real * numbers
+    if isinstance(solver, Newton):
+        numbers += _hessian_numbers(plan)
     # the coarse space: two vectors, and two dense matrices of all pieces
     pieces = int(plan.level_sizes[7])
     return real * (numbers + 8 * plan.vertices) + 8 * 2 * (_MODES * pieces) ** 2
+
+
+def _hessian_numbers(plan: Plan) -> int:
+    """Numbers of the Hessians of Newton: rotation, twists and tension of a tetrahedron, a triangle of a stencil's."""
+    numbers = 20 * plan.tet_order.numel()
+    if any(row.name == "stencil_block" for row in plan.table):
+        rows = [3 * kind.columns for kind in KINDS.values()]
+        each = [rows[kind] * (rows[kind] + 1) // 2 for kind in plan.stencil_block[:, 0].tolist()]
+        numbers += plan.stencil_order.shape[1] * sum(each)
+    return numbers
 
 
 def _step_bytes(sim: Stepper, real: int) -> str:

@@ -16,7 +16,7 @@ from ..common.checks import plain_tensor
 from ..common.gpu import check_free_memory, free_memory, properties_of, unavailable_reason, visible_devices
 from ..common.tables import EFFECT_ROWS, KINDS
 from ..ops.diagonal import pinned_vertices
-from ..scene.solvers import Multilevel
+from ..scene.solvers import Multilevel, Newton
 from .compiled import CompiledScene
 from .cpu_plan import Plan, compile_plan, with_loose_components
 from .kernel_benchmark import fastest_plan
@@ -117,7 +117,7 @@ def _compile(compiled: CompiledScene, dtype: torch.dtype, device: torch.device, 
 
 def _uses_preconditioner(compiled: CompiledScene) -> bool:
     """Whether the steps or the adjoint use a multilevel preconditioner."""
-    return isinstance(compiled.solver, Multilevel) or compiled.adjoint == "multilevel"
+    return isinstance(compiled.solver, Multilevel | Newton) or compiled.adjoint == "multilevel"
 
 
 def _has_patches_for(compiled: CompiledScene, plan: Plan) -> bool:

@@ -89,6 +89,8 @@ class PieceCycle:
     positive where M has 1 - 1 / relaxation of A^-1 on Z, because Hc <= Ac for nu = 0. Before the iterate `first` it is
     M alone; there Z, Hc and Ac are made. They are made anew after `TRIALS` iterations in a row that lowered E by less
     than `SLOW` of half the slope, which they would if H were still what it was. The secant pairs stay.
+
+    `encloses`: Z Hc^-1 Z^T / relaxation + (I - Z Ac^-1 Z^T A) M (I - A Z Ac^-1 Z^T) instead, positive whatever M is.
     """
 
     problem: Objective
@@ -97,8 +99,9 @@ class PieceCycle:
     remakes: bool = True
     first: int = 2
     relaxation: float = 1.8
+    encloses: bool = False
     made: int = field(default=0, init=False)  # how many times
-    _small: tuple[PieceSpace, Array] | None = field(default=None, init=False)
+    _small: tuple[PieceSpace, Array, Array] | None = field(default=None, init=False)
     _slow: int = field(default=0, init=False)
     _last: tuple[Array, float, Array] | None = field(default=None, init=False)  # u, E and its gradient
 
@@ -114,13 +117,20 @@ class PieceCycle:
         if iteration == self.first or (self.remakes and self.made and self._slow >= TRIALS):
             space = PieceSpace(self.problem, thinned(self.pieces), displacement)
             noise = NOISE * np.diag(np.diag(space.matrix))
-            soft, stiff = np.linalg.inv(space.hessian_alone + noise), np.linalg.inv(space.matrix + noise)
-            self._small = space, soft / self.relaxation - stiff
+            soft, stiff = (np.asarray(np.linalg.inv(m + noise), float) for m in (space.hessian_alone, space.matrix))
+            self._small = space, soft / self.relaxation, stiff
             self._slow, self.made = 0, self.made + 1
 
     def __call__(self, gradient: Array) -> Array:
-        product = self.cycle(gradient)
-        if self._small is not None:
-            space, difference = self._small
-            product = product + space.prolong(difference @ space.restrict(gradient))
-        return product
+        if self._small is None:
+            return self.cycle(gradient)
+        space, soft, stiff = self._small
+        motion = space.restrict(gradient)
+        if not self.encloses:
+            return self.cycle(gradient) + space.prolong((soft - stiff) @ motion)
+        product = self.cycle(gradient - self._resists(space.prolong(stiff @ motion)))
+        return product + space.prolong(soft @ motion - stiff @ space.restrict(self._resists(product)))
+
+    def _resists(self, field: Array) -> Array:
+        """A times a field [V, 3], zero at hard pins."""
+        return np.where(self.problem.free[:, None], self.problem.matrix @ field, 0.0)

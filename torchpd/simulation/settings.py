@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from ..common.checks import check_has_values
-from ..estimate.solver_choice import Choice, choose_solver, warn_of_few_iterations
+from ..estimate.solver_choice import TOLERANCE, Choice, choose_solver, warn_of_few_iterations
 from ..plan.compiled import CompiledScene
 from ..plan.kernel_choice import check_kernel
 from ..plan.placement import is_suitable, move_plan, plan_for_device, plan_for_solver, recompile_plan
@@ -139,16 +139,17 @@ def choose(now: Configuration, iterations: int | None) -> Configuration:
     if now.plan.for_multilevel:
         now = _solved_by(now, Chebyshev())  # the costs are compared with the kernel of Chebyshev
     solver, choice = choose_solver(now, iterations)
-    now = replace(_solved_by(now, solver), choice=choice, iterations=choice.iterations)
     named = not choice.sets_iterations
+    tolerance = now.tolerance if named or now.tolerance > 0.0 else TOLERANCE
+    now = replace(_solved_by(now, solver), choice=choice, iterations=choice.iterations, tolerance=tolerance)
     return check_iterations(
         replace(now, named_iterations=named, checked_time_steps=EVERY_STEP if named else NO_STEP), None
     )
 
 
 def choose_again(now: Configuration) -> Configuration:
-    """Repeat the choice of "auto", if there is one; iterations that were set since stay."""
+    """Repeat the choice of "auto", if there is one; iterations and tolerance that were set since stay."""
     if now.choice is None:
         return now
     own = now.choice.sets_iterations and now.iterations == now.choice.iterations
-    return choose(now, None if own else now.iterations)
+    return replace(choose(now, None if own else now.iterations), tolerance=now.tolerance)

@@ -33,6 +33,7 @@ STYLES: dict[str, tuple[str, float, str]] = {
     DEFAULT: ("#d55e00", 2.8, "solid"),
     "classic Chebyshev": ("#0072b2", 2.0, "solid"),
     "Multilevel": ("#56b4e9", 2.0, "solid"),
+    "inexact Newton": ("#cc79a7", 2.0, "solid"),
     "Multilevel, tolerance": ("#2b6f95", 2.0, "solid"),
     "Jacobi": ("#6f737b", 2.0, "solid"),
     "damped Jacobi": ("#a9adb5", 1.4, "solid"),

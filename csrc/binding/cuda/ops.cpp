@@ -76,6 +76,9 @@ struct Cuda {
 
   template <class T>
   static void step(const Step<T>& call, const Tensor& like) {
+    TORCH_CHECK_VALUE(!call.settings.newton(),
+                      "schedule must be 0 (jacobi) to 4 (momentum) on a GPU, got 5 (newton), which "
+                      "has no kernels; call the op on the CPU, or take 3 (lbfgs)");
     check_rows<T>(call);
     const bool stream = call.plan.kernel == int(DeviceKernel::stream);
     if (runs_with_poisson(call)) {

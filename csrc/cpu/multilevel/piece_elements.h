@@ -1,7 +1,7 @@
 // Hc of the elements for the coarse space of solver/multilevel/pieces.h: one environment, whichever way lanes run elsewhere.
 #pragma once
 #include "cpu/multilevel/pieces_workspace.h"
-#include "cpu/step/stencil_blocks.h"
+#include "cpu/multilevel/stencil_hessians.h"
 #include "elements/solid.h"
 
 namespace pd::inline PD_TARGET {
@@ -16,13 +16,15 @@ class PieceElements {
 
  public:
   PieceElements(const Plan<T>& plan, const Work& work, const Slots& slots,
-                const ElementWeights<T>& weights, T* numbers, bool dissipates_too)
+                const ElementWeights<T>& weights, T* numbers, bool dissipates_too,
+                const StencilHessians<T>* kept)
       : plan_(plan),
         work_(work),
         slots_(slots),
         weights_(weights),
         numbers_(numbers),
-        dissipates_too_(dissipates_too) {}
+        dissipates_too_(dissipates_too),
+        kept_(kept) {}
 
   // `position(slot)`: relative to the patch; `shift_of(piece)`: of that to the centre of a piece;
   // `moves(vertex)`: whether no pin holds it
@@ -152,15 +154,19 @@ class PieceElements {
   // dF of the modes of each piece, and K dF, with the positive part of K
   template <class Kind, class Stencils>
   void add_stencils(const Stencils& stencils) {
-    constexpr int n = Kind::corners, rows = 3 * Kind::dims;
+    constexpr int n = Kind::corners, rows = second_rows<Kind>;
     using Change = R[piece_modes][rows];
     const int pieces = find_pieces<n>(stencils.part);
     const StencilNumbers<Kind, Stencils> own(stencils);
     Vec3<R> x[n], arm[n], f[Kind::dims];
     R share[n], second[rows][rows];
     stencils.corners(0, x);
-    deform<Kind>(x, own.g, f);
-    second_derivative<Kind>(f, own, second);
+    if (kept_) {
+      kept_->template get<Kind>(stencils.part, second);
+    } else {
+      deform<Kind>(x, own.g, f);
+      positive_second_derivative<Kind>(f, own, second);
+    }
     auto* changes = reinterpret_cast<Change*>(slots_.strains.begin());
     auto* stresses = reinterpret_cast<Change*>(slots_.stresses.begin());
     for (int k = 0; k < pieces; ++k) {
@@ -187,31 +193,6 @@ class PieceElements {
         }
       }
     }
-  }
-
-  // Numbers 3 j + a: component a of column j of F.
-  template <class Kind, class Own>
-  static void second_derivative(const Vec3<R> (&f)[Kind::dims], const Own& own,
-                                R (&second)[3 * Kind::dims][3 * Kind::dims]) {
-    constexpr int rows = 3 * Kind::dims;
-    const R none(T(0)), one(T(1)), half(T(0.5));
-    R found[rows][rows];
-    for (int c = 0; c < rows; ++c) {
-      Vec3<R> df[Kind::dims], dp[Kind::dims];
-      for (int j = 0; j < Kind::dims; ++j) {
-        df[j] = {c == 3 * j ? one : none, c == 3 * j + 1 ? one : none, c == 3 * j + 2 ? one : none};
-      }
-      stress_differential<Kind>(f, df, own.p, own.c, dp);
-      for (int j = 0; j < Kind::dims; ++j) {
-        found[3 * j][c] = dp[j].x;
-        found[3 * j + 1][c] = dp[j].y;
-        found[3 * j + 2][c] = dp[j].z;
-      }
-    }
-    for (int r = 0; r < rows; ++r) {
-      for (int c = 0; c < rows; ++c) second[r][c] = half * (found[r][c] + found[c][r]);
-    }
-    clamp_positive(second);
   }
 
   // e G^T of a translation along e, and e x N of a turn: G = sum w_c g_c, N = sum w_c r_c g_c^T
@@ -244,6 +225,7 @@ class PieceElements {
   ElementWeights<T> weights_;
   T* numbers_;
   bool dissipates_too_;
+  const StencilHessians<T>* kept_;  // at these positions, or null
   PieceMask mask_ = 0;
   Vec3<T> shift_[most_pieces];  // by rank in the patch
   int rank_[most_pieces];

@@ -20,12 +20,14 @@ class PiecesOfTeam {
 
   bool there() const { return work_.pieces > 0; }
 
-  void make(const Value* base, const bool (&asks)[width], const double (&scales)[width]) const {
-    PiecesMaker<Lanes>(plan_, team_, w_, work_).make(base, asks, scales);
+  // `kept`: the second derivatives of stencils at `base`, or null
+  void make(const Value* base, const bool (&asks)[width], const double (&scales)[width],
+            const StencilHessians<T>* kept = nullptr) const {
+    PiecesMaker<Lanes>(plan_, team_, w_, work_, kept).make(base, asks, scales);
   }
   // With contacts: the lanes that have it, where these leave the directions `free`.
   void hold(const Mat3<Real>* free, const bool (&has)[width], const double (&scales)[width]) const {
-    PiecesMaker<Lanes>(plan_, team_, w_, work_).hold(free, has, scales);
+    PiecesMaker<Lanes>(plan_, team_, w_, work_, nullptr).hold(free, has, scales);
   }
   bool is_held(int lane) const { return there() && work_.factors[lane].held; }
 

@@ -19,8 +19,10 @@ class PiecesMaker {
   static constexpr int width = Lanes::environments;
 
  public:
-  PiecesMaker(const Plan<T>& plan, const Team& team, const Workspace<Lanes>& step, Work& work)
-      : plan_(plan), levels_(plan.levels), team_(team), w_(step), work_(work) {}
+  // `kept`: the second derivatives of stencils where it is made, or null
+  PiecesMaker(const Plan<T>& plan, const Team& team, const Workspace<Lanes>& step, Work& work,
+              const StencilHessians<T>* kept)
+      : plan_(plan), levels_(plan.levels), team_(team), w_(step), work_(work), kept_(kept) {}
 
   // Makes it for the lanes that ask, of positions x + u: `base` is u. Their material is that of A times `scales` at most.
   void make(const Value* base, const bool (&asks)[width], const double (&scales)[width]) {
@@ -200,7 +202,7 @@ class PiecesMaker {
         numbers[n] = w_.numbers[n * width + lane];
     }
     PieceElements<T, Work> elements(plan_, work_, work_.slots[team_.rank], weights, numbers,
-                                    w_.per_time > T(0));
+                                    w_.per_time > T(0), kept_);
     for (int patch = team_.begin(plan_.patches); patch < team_.end(plan_.patches); ++patch) {
       const Value anchor = w_.x[plan_.slot_vertex[plan_.patch_slot[patch]]] - middle_;
       elements.add(
@@ -339,6 +341,7 @@ class PiecesMaker {
   const Team& team_;
   const Workspace<Lanes>& w_;
   Work& work_;
+  const StencilHessians<T>* kept_;
   Real wanted_{T(0)};
   Value middle_;
 };

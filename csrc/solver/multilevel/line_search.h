@@ -59,7 +59,7 @@ struct LineSearch {
   StoppingTest stop;
   int fallback_left = 0;  // iterations left of a fallback
   bool plain_jacobi = false, accepted = true, known = false;
-  bool friction = false;
+  bool friction = false, overshoots = false;  // the latter: the trial of Newton's method
   // accelerated Jacobi iterations: to the end of the step with momentum, during a fallback with L-BFGS
   bool jacobi = false;
   // the step length without failures, the number of reductions, and the fallbacks of the step
@@ -88,7 +88,8 @@ struct LineSearch {
     const bool preconditioned = !plain_jacobi && !jacobi;
     const double demanded = learns && preconditioned ? armijo_factor * length_taken * slope : 0;
     if (preconditioned) judge(trial, length_taken);
-    const bool decreased = !known || trial <= energy - demanded + slack * absolute(energy);
+    const bool decreased =
+        !overshoots && (!known || trial <= energy - demanded + slack * absolute(energy));
     // friction has no energy: with it the Jacobi iteration is a fixed-point map, and continues
     accepted = decreased || ((plain_jacobi || jacobi) && friction && trial < HUGE_VAL);
     restarts += !decreased;
@@ -151,6 +152,12 @@ struct LineSearch {
   PD_HD void rebuilt() {
     path_since_coarse = 0;
     slow = 0;
+  }
+
+  // The next direction is a new one of Newton's method: its full step comes first.
+  PD_HD void renewed() {
+    step_length = 1;
+    reductions = 0;
   }
 
   // Whether the slope g.d of a direction is negative. If not, the secant pairs do not hold here.

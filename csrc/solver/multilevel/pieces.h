@@ -123,7 +123,18 @@ struct PieceFrame {
     const Stretches<R> at(f, rotation);
     const R trace = ((at.s[0] + at.s[1]) + at.s[2]) - R(T(3));
     const R known = select(none < weight, weight, one);
-    const R share = one - lesser(pressure * trace, known) / known;
+    find_twists(at, one - lesser(pressure * trace, known) / known);
+  }
+  // `share` of the 2 that tension leaves
+  PD_HD PieceFrame(const Mat3<R>& f, const Mat3<R>& rotation, const R& share)
+      : back(transpose(rotation)) {
+    find_twists(Stretches<R>(f, rotation), share);
+  }
+
+ private:
+  PD_HD void find_twists(const Stretches<R>& at, const R& share) {
+    using T = scalar_of<R>;
+    const R one(T(1));
     for (int k = 0; k < 3; ++k) {
       const R sum = at.s[(k + 1) % 3] + at.s[(k + 2) % 3], least(smallest<T>() * T(4));
       const R soft = lesser(one, R(T(2)) * share / greater(sum, least));
