@@ -9,8 +9,10 @@
 
 namespace pd {
 
-// Positions, velocities, info; then numbers of the contact, how far colliders were held back, and the history.
-using ContactOutputs = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+// Positions, velocities, info; then numbers of the contact, how far colliders were held back, the history, and forces of
+// contact on every vertex.
+using ContactOutputs =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 // The arrays of a contact plan, in their order.
 enum ContactArray : int {
@@ -99,7 +101,7 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
 
 template <class Backend, class T>
 ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at::TensorList history,
-                                  at::TensorList contact, const Settings& settings) {
+                                  at::TensorList contact, const Settings& settings, bool report) {
   StepCall<T> call;
   const Place place{t.positions.device()};
   call.plan = Backend::template plan_view<T>(t.plan, place);
@@ -142,7 +144,8 @@ ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at:
                held = at::empty({b, c}, x.options()),
                next_poses = at::empty({b, c, 7}, x.options()),
                next_keys = at::empty({b, m}, history[1].options()),
-               next_forces = at::empty({b, m, 4}, x.options());
+               next_forces = at::empty({b, m, 4}, x.options()),
+               pushes = at::empty({b, of.plan.vertices, 3}, x.options());
   of.history = {history[0].const_data_ptr<T>(),
                 history[1].const_data_ptr<std::int64_t>(),
                 history[2].const_data_ptr<T>(),
@@ -152,9 +155,11 @@ ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at:
   of.poses = poses.const_data_ptr<T>();
   of.info = info.mutable_data_ptr<double>();
   of.held_back = held.mutable_data_ptr<T>();
+  of.forces = pushes.mutable_data_ptr<T>();
+  of.report = report;
   if (b > 0) Backend::contact_step(call, of);
-  return {t.out_positions, t.out_velocities, t.info,     info, held,
-          next_poses,      next_keys,        next_forces};
+  return {t.out_positions, t.out_velocities, t.info,      info,  held,
+          next_poses,      next_keys,        next_forces, pushes};
 }
 
 template <class Backend>
@@ -171,8 +176,9 @@ ContactOutputs contact_step(const Numbers& n, const Tensor& positions, const Ten
   const Settings settings = settings_of(n, false, 1, 1);
   const ContactOutputs made =
       positions.scalar_type() == at::kFloat
-          ? contact_step_typed<Backend, float>(tensors, poses, history, contact, settings)
-          : contact_step_typed<Backend, double>(tensors, poses, history, contact, settings);
+          ? contact_step_typed<Backend, float>(tensors, poses, history, contact, settings, n.report)
+          : contact_step_typed<Backend, double>(tensors, poses, history, contact, settings,
+                                                n.report);
   if (n.report) report_step<Backend>(tensors, n);
   return made;
 }

@@ -141,7 +141,8 @@ TORCH_LIBRARY(torchpd, m) {
   with_plan(
       "contact_step(Tensor positions, Tensor velocities, Tensor? forces, Tensor poses, Tensor[] "
       "history, Tensor[] material, Tensor[] plan, Tensor[] contact, *, " +
-      settings_schema() + ") -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+      settings_schema() +
+      ") -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
   with_plan(
       "rollout(Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, Tensor[] "
       "plan, *, SymInt steps, SymInt every, " +

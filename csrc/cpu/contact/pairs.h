@@ -216,6 +216,26 @@ struct PairList {
     });
   }
 
+  // calls visit(vertex) for one vertex of each side of all pairs
+  template <class Visit>
+  void each_side(const Visit& visit) const {
+    for (const ContactPair<T>& pair : pairs) {
+      visit(pair.vertex[0]);
+      visit(pair.vertex[3]);
+    }
+  }
+
+  // Adds the forces of all pairs to those of the vertices.
+  void add_forces(std::vector<Vec3<T>>& force) const {
+    for (const ContactPair<T>& pair : pairs) {
+      const Vec3<T> each = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
+      for (int a = 0; a < 4; ++a) {
+        const int v = pair.vertex[a];
+        force[v] = multiply_add(pair.near.weight[a], each, force[v]);
+      }
+    }
+  }
+
   bool is_stuck(int vertex) const {
     bool stuck = false;
     each_of(vertex, [&](const ContactPair<T>& pair, int) { stuck = stuck || pair.plane.frozen; });

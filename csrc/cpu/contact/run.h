@@ -39,6 +39,7 @@ class ContactRun {
   Places& target() { return target_; }            // of the next one, before contact
   Places& goal() { return goal_; }                // of what moves by hand
   std::vector<T>& inverse() { return inverse_; }  // 1 / D; 0 for what moves by hand
+  const PairList<T>& list() const { return list_; }
   bool moves_by_hand(int vertex) const { return held_[vertex] != 0; }
   bool was_cut(int vertex) const { return cut_[vertex] != 0; }
   bool is_at_rest() const { return !cut_any_ && !waits_; }
@@ -264,15 +265,6 @@ class ContactRun {
       if (plan_.body[a] == plan_.body[b]) continue;
       visit(a);
       visit(b);
-    }
-  }
-
-  // the same for all pairs in the list
-  template <class Visit>
-  void each_listed(const Visit& visit) const {
-    for (const ContactPair<T>& pair : list_.pairs) {
-      visit(pair.vertex[0]);
-      visit(pair.vertex[3]);
     }
   }
 

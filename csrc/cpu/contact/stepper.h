@@ -69,7 +69,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
       return;
     }
     if (plan_.components == 0) return;
-    correct([&](const auto& visit) { run_.each_listed(visit); });
+    correct([&](const auto& visit) { run_.list().each_side(visit); });
     want([&](int i) { return w_.u[i]; });
     run_.prepare(set_.iterations);
     go();
@@ -94,6 +94,14 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     run_.prepare(k);
     const double change = go();
     if (set_.tolerance > 0) stop(change, omega);
+  }
+
+  void finish() {
+    run_.measure();
+    forces_.assign(run_.plan().vertices, Vec3<T>{T(0), T(0), T(0)});
+    run_.list().add_forces(forces_);
+    residual_ = contact_.report ? residual() : double(NAN);
+    Base::finish();
   }
 
  private:
@@ -197,10 +205,30 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     done_[0] = met && change < HUGE_VAL;
   }
 
+  // |r| / max(|r|, |f|): of r, the part of the gradient that neither pairs nor planes, spheres and pins balance, and of f,
+  // the forces of inertia and of elements on every vertex.
+  double residual() {
+    double left = 0, whole = 0;
+    sweep_.run(0, elastic_gradient<false>(), [&](std::int64_t i, const Value& force, Sum&) {
+      const auto v = vertex(i);
+      if (!(v.inverse > T(0))) return;
+      const Value push = Lanes::value(forces_[plan_.vertex_order[i]]);
+      const Value inertia = v.inertia * (w_.u[i] - v.target);
+      left += square(v.residual(contacts_, w_.u[i], force - push));
+      whole += square(inertia) + square(force);
+    });
+    const double most = left > whole ? left : whole;
+    return most > 0 ? std::sqrt(left / most) : 0;
+  }
+
+  static double square(const Value& a) {
+    const Vec3<T> b = Lanes::vec3(a);
+    return double(dot(b, b));
+  }
+
   // Poses, forces and numbers of the contact, for the caller. An overflow takes the step back.
   void write() {
     const ContactPlan<T>& plan = run_.plan();
-    run_.measure();
     const std::int64_t row = environment_ * plan.capacity;
     std::int64_t* key = contact_.history.next_keys + row;
     T* force = contact_.history.next_forces + 4 * row;
@@ -229,10 +257,13 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     info[contact_shortened] = double(run_.shortened);
     info[contact_frozen] = double(run_.frozen);
     info[contact_pins_held_back] = run_.held_back(0, plan.body_vertices);
+    info[contact_residual] = residual_;
+    T* const push = contact_.forces + environment_ * plan.vertices * 3;
+    for (int v = 0; v < plan.vertices; ++v) Base::write(push + 3 * v, forces_[v]);
     if (run_.overflows()) take_back();
   }
 
-  // Positions and velocities stay; so do poses and forces.
+  // Positions and velocities stay; so do poses and forces. No force acts on the vertices.
   void take_back() {
     const ContactPlan<T>& plan = run_.plan();
     const std::int64_t count = std::int64_t(plan_.vertices) * 3, row = environment_ * plan.capacity,
@@ -241,6 +272,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
                 call_.out_positions + environment_ * count);
     std::copy_n(call_.velocities + environment_ * count, count,
                 call_.out_velocities + environment_ * count);
+    std::fill_n(contact_.forces + environment_ * plan.vertices * 3, plan.vertices * 3, T(0));
     std::copy_n(contact_.history.keys + row, plan.capacity, contact_.history.next_keys + row);
     std::copy_n(contact_.history.forces + 4 * row, 4 * plan.capacity,
                 contact_.history.next_forces + 4 * row);
@@ -254,8 +286,10 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   std::int64_t environment_;
   // displacements of the next iterate before contact; a Quad is aligned more than std::vector grants
   std::vector<Vec3<T>> free_ = std::vector<Vec3<T>>(plan_.vertices);
-  std::vector<int> inside_;    // internal number of the user's vertices
-  std::vector<char> touches_;  // [components]
+  std::vector<int> inside_;      // internal number of the user's vertices
+  std::vector<char> touches_;    // [components]
+  std::vector<Vec3<T>> forces_;  // of contact, on every vertex
+  double residual_ = 0;
   bool begun_ = false;
 };
 

@@ -41,6 +41,7 @@ enum ContactInfo : int {
   contact_shortened,       // vertices whose way was cut, summed over iterations
   contact_frozen,          // vertices that no plane let move, summed over iterations
   contact_pins_held_back,  // m
+  contact_residual,        // share of the forces that is not balanced; NaN unless requested
   contact_info_count
 };
 
@@ -51,6 +52,8 @@ struct ContactCall {
   const T* poses;  // [batch, colliders, 7] at the step's end
   double* info;    // [batch, contact_info_count]
   T* held_back;    // [batch, colliders] m
+  T* forces;       // [batch, vertices, 3] N of contact on every vertex at the end of the step
+  bool report;     // whether the residual is wanted
 };
 
 }  // namespace pd
