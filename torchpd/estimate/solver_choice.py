@@ -144,10 +144,14 @@ def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solv
     plain, levels = (_known(forecast(compiled, solver, spectrum)) for solver in (chebyshev, multilevel))
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
     if not runs(multilevel, compiled):
-        where = "a scene with Contact" if compiled.scene.contact is not None else (
-            f"{compiled.device} with kernel={compiled.kernel!r}"
-            if compiled.device.type == "cuda"
-            else str(compiled.device)
+        where = (
+            "a scene with Contact"
+            if compiled.scene.contact is not None
+            else (
+                f"{compiled.device} with kernel={compiled.kernel!r}"
+                if compiled.device.type == "cuda"
+                else str(compiled.device)
+            )
         )
         return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
     batch = compiled.batch or 1

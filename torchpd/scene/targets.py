@@ -110,9 +110,8 @@ class Anchors:
                 continue
             else:
                 raise ValueError(
-                    f"targets: this {type(part).__name__} is not a Pin, Sphere, Fibres, Pressure, Wind or Collider of the "
-                    "scene; "
-                    "parts go by identity: a pickled or loaded simulator has its own in sim.scene.pins, "
+                    f"targets: this {type(part).__name__} is not a Pin, Sphere, Fibres, Pressure, Wind or Collider of "
+                    "the scene; parts go by identity: a pickled or loaded simulator has its own in sim.scene.pins, "
                     "sim.scene.spheres, sim.scene.fibres, sim.scene.pressures, sim.scene.wind and sim.scene.colliders"
                 )
             axis = -1 if name == "fibre_length" else -2

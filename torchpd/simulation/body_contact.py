@@ -74,7 +74,7 @@ class BodyContact:
         before = ContactHistory(*state[2])  # type: ignore[misc]
         history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.contiguous()]
         wanted = history[0] if poses is None else poses.contiguous()
-        positions, velocities, rows, numbers, held, *kept = _ops.contact_step(
+        positions, velocities, rows, numbers, held, actual, keys, pushes = _ops.contact_step(
             state[0], state[1], forces, wanted, history, material, plan, self.arrays, **settings
         )
         flow = before.flow
@@ -87,7 +87,7 @@ class BodyContact:
         unknown = torch.full_like(held_back, torch.nan)
         own = torch.stack([numbers[:, _GAP], numbers[:, _MISSING], held_back], dim=1)
         rows = torch.cat([unknown[:, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
-        return HistoryState(positions, velocities, ContactHistory(*kept, flow)), rows
+        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
 
     def check(self, state: State | HistoryState) -> None:
         """Refuse a state in which surfaces of an environment cross or touch, or whose poses are none."""
@@ -131,8 +131,8 @@ def _refuse_transforms(state: State | HistoryState, material: list[Tensor]) -> N
         return
     if any(map(torch._C._functorch.is_functorch_wrapped_tensor, (state[0], state[1], *material))):
         raise RuntimeError(
-            "a step with Contact must not be transformed by torch.func or vmap, got a mapped state or material; put the "
-            "environments in the batch of a state instead: sim.rest_state(batch)"
+            "a step with Contact must not be transformed by torch.func or vmap, got a mapped state or material; "
+            "put the environments in the batch of a state instead: sim.rest_state(batch)"
         )
 
 

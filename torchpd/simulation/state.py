@@ -179,7 +179,7 @@ def _where(state: _Some, condition: Any, other: Any) -> _Some:
             f"{condition.dtype} {list(condition.shape)}"
         )
     alike = isinstance(other, (tuple, list)) and len(other) == len(state) and _has_history(other)
-    if not alike or len(state) > 2 and len(state[2]) != len(other[2]):  # type: ignore[misc]
+    if not alike or (len(state) > 2 and len(state[2]) != len(other[2])):  # type: ignore[misc]
         raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__}, got {type(other).__name__}")
     theirs_of = _tensors_by_name(other)
     for name, mine in _tensors_by_name(state).items():
@@ -245,7 +245,7 @@ class Info(NamedTuple):
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """Build it from rows of a step [..., 7], with `Contact` [..., 10]; files from before `inverted` have 6 columns."""
+        """Build it from rows of a step [..., 7], with `Contact` [..., 10]; files without `inverted` have 6 columns."""
         residual, energy, iterations, restarts, converged, rho, *counted = rows.unbind(-1)
         inverted = counted[0] if counted else torch.full_like(rho, -1.0)
         of_step = residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long()

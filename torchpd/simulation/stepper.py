@@ -381,8 +381,8 @@ class Stepper(Readable):
 def _refuse_start(given: Tensor | None) -> None:
     if given is not None:
         raise ValueError(
-            'start must be "velocity" or "inertial" in a scene with Contact, got positions, which bodies in the way may '
-            "keep a step from; leave it out"
+            'start must be "velocity" or "inertial" in a scene with Contact, got positions, which others may be in '
+            "the way of; leave it out"
         )
 
 

@@ -18,6 +18,7 @@ __all__ = ["crossings", "linking_number"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+
 def crossings(surfaces: Surfaces, positions: Tensor) -> Index:
     """Edges and triangles [n, 2] that cross at positions [N, 3], among those that may be in contact."""
     # boxes that only touch hold no crossing: its point is inside both
