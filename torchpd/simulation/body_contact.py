@@ -69,7 +69,7 @@ class BodyContact:
             plan: arrays of the compiled scene.
             settings: of a step, by name.
         """
-        _refuse_transforms(state, material)
+        self.check_transforms(state[0], state[1], *material)
         _refuse_gradients(state, forces, poses, material)
         before = ContactHistory(*state[2])  # type: ignore[misc]
         history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.contiguous()]
@@ -88,6 +88,17 @@ class BodyContact:
         own = torch.stack([numbers[:, _GAP], numbers[:, _MISSING], held_back], dim=1)
         rows = torch.cat([unknown[:, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
         return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
+
+    @staticmethod
+    def check_transforms(*given: Tensor) -> None:
+        """Refuse `torch.func.vmap` and its kin, where not traced: the op refuses them there."""
+        if torch.compiler.is_compiling():
+            return
+        if any(map(torch._C._functorch.is_functorch_wrapped_tensor, given)):
+            raise RuntimeError(
+                "a step with Contact must not be transformed by torch.func or vmap, got mapped arguments; "
+                "put the environments in the batch of a state instead: sim.rest_state(batch)"
+            )
 
     def check(self, state: State | HistoryState) -> None:
         """Refuse a state in which surfaces of an environment cross or touch, or whose poses are none."""
@@ -123,17 +134,6 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype) -> list[Tensor]:
     reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction, [plan.thickness]]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     return [*map(whole, [sizes, *surfaces, *trees]), keys, *map(real, reals)]
-
-
-def _refuse_transforms(state: State | HistoryState, material: list[Tensor]) -> None:
-    """Refuse `torch.func.vmap` and its kin, where not traced: the op refuses them there."""
-    if torch.compiler.is_compiling():
-        return
-    if any(map(torch._C._functorch.is_functorch_wrapped_tensor, (state[0], state[1], *material))):
-        raise RuntimeError(
-            "a step with Contact must not be transformed by torch.func or vmap, got a mapped state or material; "
-            "put the environments in the batch of a state instead: sim.rest_state(batch)"
-        )
 
 
 def _refuse_gradients(

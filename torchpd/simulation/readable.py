@@ -68,6 +68,8 @@ class Readable(Model):
         """Poses of the colliders [B, C, 7] at the end of a step from a checked state; None: they stay."""
         if self.body_contact is None:
             return None
+        if isinstance(targets, Mapping):
+            self.body_contact.check_transforms(*targets.values())
         return self.anchors.place_colliders(targets, state[2][0])  # type: ignore[misc]
 
     def load_values(self, targets: Targets | None, batch: int) -> dict[str, Tensor]:

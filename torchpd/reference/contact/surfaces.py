@@ -89,12 +89,14 @@ class Surfaces:
     def edges(self) -> Tensor:
         """Edges of the triangles [E, 2], each once."""
         sides = torch.cat([self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]])
-        return torch.unique(sides.sort(dim=1).values, dim=0)
+        edges: Tensor = torch.unique(sides.sort(dim=1).values, dim=0)
+        return edges
 
     @cached_property
     def vertices(self) -> Tensor:
         """Vertices of the triangles [S]."""
-        return torch.unique(self.triangles)
+        vertices: Tensor = torch.unique(self.triangles)
+        return vertices
 
     @cached_property
     def cell(self) -> Tensor:
