@@ -101,7 +101,7 @@ class Contact(KeyPart):
             Parts of a body that rest nearer than twice that have half of their distance at rest. None: a twentieth of
             the mean edge, the least of all bodies and colliders.
         capacity: most pairs of a vertex and a triangle, or of two edges, that an environment may have near each other
-            in a step. None: 8 per triangle.
+            in a step. None: 16 per triangle.
 
     Example:
         >>> scene = Scene(cloth, table, Contact(friction=0.4))

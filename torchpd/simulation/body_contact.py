@@ -18,7 +18,7 @@ from .state import ContactHistory, HistoryState, State
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_GAP, _MISSING, _PINS_HELD_BACK = 0, 1, 6  # columns of the numbers of an environment, csrc/cpu/contact/views.h
+_GAP, _MISSING, _PINS_HELD_BACK = 0, 1, -1  # columns of the numbers of an environment, csrc/cpu/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 
 
@@ -131,7 +131,8 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype) -> list[Tensor]:
     sizes = [len(plan.self_contact), len(plan.poses), plan.capacity]
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     trees = [plan.vertex_tree.order, plan.triangle_tree.order, plan.edge_tree.order]
-    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction, [plan.thickness]]
+    friction = plan.friction if len(plan.friction) > 1 else plan.friction[0]  # arrays of one column are [n]
+    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, friction, [plan.thickness]]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     return [*map(whole, [sizes, *surfaces, *trees]), keys, *map(real, reals)]
 

@@ -178,9 +178,11 @@ def _where(state: _Some, condition: Any, other: Any) -> _Some:
             f"{kind.__name__}.where: condition must be bool [{len(state.positions)}], one for each environment, got "
             f"{condition.dtype} {list(condition.shape)}"
         )
-    alike = isinstance(other, (tuple, list)) and len(other) == len(state) and _has_history(other)
-    if not alike or (len(state) > 2 and len(state[2]) != len(other[2])):  # type: ignore[misc]
+    if not isinstance(other, (tuple, list)) or len(other) != len(state) or not _has_history(other):
         raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__}, got {type(other).__name__}")
+    if isinstance(state, HistoryState) and len(state.history) != len(other[2]):
+        own, theirs = type(state.history).__name__, type(history_of(other[2])).__name__
+        raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__} with a {own}, got one with a {theirs}")
     theirs_of = _tensors_by_name(other)
     for name, mine in _tensors_by_name(state).items():
         theirs = theirs_of[name]
