@@ -182,7 +182,9 @@ def _where(state: _Some, condition: Any, other: Any) -> _Some:
         raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__}, got {type(other).__name__}")
     if isinstance(state, HistoryState) and len(state.history) != len(other[2]):
         wanted, came = type(state.history).__name__, type(history_of(other[2])).__name__
-        raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__} with a {wanted}, got one with a {came}")
+        raise TypeError(
+            f"{kind.__name__}.where: other must be a {kind.__name__} with a {wanted}, got one with a {came}"
+        )
     theirs_of = _tensors_by_name(other)
     for name, mine in _tensors_by_name(state).items():
         theirs = theirs_of[name]
