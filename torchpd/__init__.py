@@ -23,7 +23,7 @@ from .scene.scene import Scene
 from .scene.solvers import Chebyshev, Jacobi, Multilevel, Newton
 from .scene.springs import Springs
 from .scene.tie import Tie
-from .simulation.state import History, HistoryState, HistoryTrack, Info, State, Track
+from .simulation.state import ContactHistory, History, HistoryState, HistoryTrack, Info, State, Track
 from .version import __version__
 
 if load_extension()[0] is not None:
@@ -54,6 +54,7 @@ __all__ = [
     "Collider",
     "Contact",
     "ContactForces",
+    "ContactHistory",
     "Damping",
     "Embedding",
     "Fibres",

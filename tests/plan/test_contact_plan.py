@@ -62,7 +62,7 @@ def test_the_surface_of_a_cube_on_a_table() -> None:
     np.testing.assert_allclose(plan.cell, [*[mean] * 27, *[(4 + np.sqrt(2)) / 5] * 4])
     assert plan.friction.tolist() == [[0, 0.5], [0.5, 0.5]]
     assert plan.self_contact.tolist() == [True, False]
-    assert (plan.thickness, plan.capacity, len(plan.near.keys)) == (1e-3, 8 * 50, 0)
+    assert (plan.thickness, plan.capacity, len(plan.near.keys)) == (1e-3, 16 * 50, 0)
     assert {str(of.dtype) for of in (plan.vertices, plan.triangles, plan.edges, plan.body, plan.collider)} == {"int32"}
 
 

@@ -230,6 +230,23 @@ def test_learn_from_images(run, tmp_path: Path) -> None:
     assert Image.open(out).size == (4 * 24, 3 * 24)
 
 
+def test_lift_cube(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Friction lifts the cube by what the fingers are, to a millimetre; without it the cube stays."""
+    studio = viewing.Studio
+    monkeypatch.setattr(viewing, "Studio", lambda *a, **more: studio(*a, **{**more, "size": (48, 36), "samples": 1}))
+    cube, fingers = r"cube lifted by (\S+) m, fingers by (\S+) m", r"fingers held back by at most (\S+) m"
+    text = run("lift_cube.py", "--cells", "2", "--out", "lift.png")
+    lifted, way = numbers(text, cube)
+    assert way == pytest.approx(0.1)
+    assert lifted == pytest.approx(way, abs=1e-3)
+    assert numbers(text, fingers) == [0.0]
+    (gap,) = numbers(text, r"least distance of surfaces: (\S+) of")
+    assert 0.1 <= gap < 1.01
+    assert Image.open("lift.png").size[0] > 4 * 48
+    lifted, _ = numbers(run("lift_cube.py", "--cells", "2", "--friction", "0"), cube)
+    assert abs(lifted) < 1e-3
+
+
 def test_read_forces(run, tmp_path: Path) -> None:
     text = run("read_forces.py", "--out", str(tmp_path / "end.pvd"))
     (weight,), (ball, vertices), (clamp, moment) = (

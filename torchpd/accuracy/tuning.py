@@ -125,8 +125,8 @@ def tune(
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
     if sim.keeps_history:
         raise ValueError(
-            "tune: the scene must have no plastic solids, whose flow its study does not follow, got some; set solver "
-            "and iterations"
+            "tune: the scene must have no plastic solids and no Contact, which its study does not follow, got some; "
+            "set solver and iterations"
         )
     start = sim.rest_state() if state is None else state
     check_start(sim, start, forces)

@@ -150,9 +150,13 @@ def choose_solver(compiled: CompiledScene, iterations: int | None) -> tuple[Solv
     counts = f"{plain.words(AIM)} iterations of Chebyshev reach {AIM:g}"
     if not runs(multilevel, compiled):
         where = (
-            f"{compiled.device} with kernel={compiled.kernel!r}"
-            if compiled.device.type == "cuda"
-            else str(compiled.device)
+            "a scene with Contact"
+            if compiled.scene.contact is not None
+            else (
+                f"{compiled.device} with kernel={compiled.kernel!r}"
+                if compiled.device.type == "cuda"
+                else str(compiled.device)
+            )
         )
         return chebyshev, chosen(_enough(plain), f"{counts}, and Multilevel does not run on {where}")
     batch = compiled.batch or 1
@@ -211,6 +215,8 @@ def _relaxation(spectrum: Spectrum | None) -> float | None:
 
 def runs(solver: Solver, compiled: CompiledScene) -> bool:
     """Whether there are kernels for the solver on the device of the scene."""
+    if compiled.scene.contact is not None and isinstance(solver, Multilevel):
+        return False
     try:
         check_solver(solver, compiled.device)
     except RuntimeError:

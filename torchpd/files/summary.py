@@ -27,10 +27,11 @@ from ..scene.tie import Tie
 
 if TYPE_CHECKING:
     from ..accuracy.tuning_result import TuningResult
+    from ..plan.contact_plan import ContactPlan
     from ..plan.cpu_plan import Plan
     from ..simulation.stepper import Stepper
 
-__all__ = ["describe", "workspace_bytes"]
+__all__ = ["contact_bytes", "describe", "workspace_bytes"]
 
 # cost of an effect that only changes the weights and targets, which every vertex has anyway
 _FOLDED = "part of the vertex weights: no cost per iteration"
@@ -131,9 +132,13 @@ def _effect_lines(sim: Stepper) -> list[str]:
         lines.append(f"grounds: {len(scene.grounds)}, one projection per vertex and iteration each")
     if scene.spheres:
         lines.append(f"spheres: {len(scene.spheres)}, one projection per vertex and iteration each")
-    if (contact := scene.contact_values) is not None:
-        rigid, taking = len(contact.poses), len(np.unique(contact.body[contact.triangles[:, 0]]))
-        lines.append(f"contact: {taking - rigid} bodies, {rigid} colliders ({len(contact.triangles)} triangles)")
+    if sim.body_contact is not None:
+        plan = sim.body_contact.plan
+        rigid, taking = len(plan.poses), len(np.unique(plan.body[plan.triangles[:, 0]]))
+        lines.append(
+            f"contact: {taking - rigid} bodies, {rigid} colliders ({len(plan.triangles)} triangles), thickness "
+            f"{plan.thickness:.3g} m, up to {plan.capacity} pairs in each environment"
+        )
     return lines
 
 
@@ -274,11 +279,20 @@ def _hessian_numbers(plan: Plan) -> int:
     return numbers
 
 
+def contact_bytes(plan: ContactPlan, real: int) -> int:
+    """Memory of `Contact` for one environment [B]: its history, and the pairs and places of a step."""
+    history = plan.capacity * (8 + 4 * real) + 7 * len(plan.poses) * real
+    # a pair twice, as found and as listed, its places in the lists of four vertices, and the force of the last step
+    pairs = plan.capacity * (2 * (32 + 24 * real) + 16 + 8 + 4 * real)
+    return history + pairs + len(plan.rest) * 24 * real
+
+
 def _step_bytes(sim: Stepper, real: int) -> str:
     """Text about the memory of a step, besides plan, material and states."""
     plan = sim.plan
     if plan.kernel is None:
-        return f"{workspace_bytes(plan, real, sim.solver):,} B per environment during a step"
+        contact = 0 if sim.body_contact is None else contact_bytes(sim.body_contact.plan, real)
+        return f"{workspace_bytes(plan, real, sim.solver) + contact:,} B per environment during a step"
     scene = sim.compiled
     batch = scene.environments
     each = -(-step_bytes(scene, plan, batch, sim.device) // batch)

@@ -16,6 +16,8 @@ from .diagonal import CORE_COUNT, STIFFNESS_PLACE, elastic_rows, named_material
 __all__ = ["INFO_WIDTH"]
 
 INFO_WIDTH = _C.info_numbers
+CONTACT_INFO_WIDTH = 8  # contact_info_count of csrc/cpu/contact/views.h
+CONTACT_BODY = 4  # place of the body of each vertex among the arrays of contact, csrc/binding/contact_ops.h
 
 
 def _register_fake(name: str) -> Callable[[Callable[..., Any]], None]:
@@ -55,6 +57,28 @@ def _(positions: Tensor, *_: Any, steps: int, every: int, **__: Any) -> tuple[Te
     shape = (steps // every, *positions.shape)
     info = positions.new_empty((*shape[:2], INFO_WIDTH), dtype=torch.float64)
     return positions.new_empty(shape), positions.new_empty(shape), info
+
+
+@_register_fake("contact_step")
+def _(
+    positions: Tensor,
+    velocities: Tensor,
+    forces: Tensor | None,
+    poses: Tensor,
+    history: Sequence[Tensor],
+    material: Sequence[Tensor],
+    plan: Sequence[Tensor],
+    contact: Sequence[Tensor],
+    **_: Any,
+) -> tuple[Tensor, ...]:
+    batch, colliders = poses.shape[:2]
+    info, numbers = (
+        positions.new_empty((batch, width), dtype=torch.float64) for width in (INFO_WIDTH, CONTACT_INFO_WIDTH)
+    )
+    held_back = positions.new_empty((batch, colliders))
+    state = positions.new_empty(positions.shape), positions.new_empty(velocities.shape)
+    pushes = positions.new_empty((batch, len(contact[CONTACT_BODY]), 3))
+    return *state, info, numbers, held_back, *(part.new_empty(part.shape) for part in history), pushes
 
 
 @_register_fake("gradient")

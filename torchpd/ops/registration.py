@@ -301,11 +301,27 @@ def _rotation_differential_backward(ctx: Any, grad: Tensor) -> tuple[Tensor | No
     return grads
 
 
+def _refuse_mapped_contact(*_: Any, **__: Any) -> Any:
+    raise RuntimeError(
+        "torchpd::contact_step: a step with Contact must not be mapped by vmap; put the environments in the batch of a "
+        "state instead: sim.rest_state(batch)"
+    )
+
+
+def _refuse_contact_backward(ctx: Any, *_: Any) -> Any:
+    raise RuntimeError(
+        "torchpd::contact_step: a step with Contact has no derivative; detach() its inputs, or step under "
+        "torch.no_grad()"
+    )
+
+
+register_rule("contact_step", _refuse_mapped_contact)
 register_rule("step_vjp", step_vjp_rule)
 register_rule("rollout_vjp", rollout_vjp_rule)
 
 
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
+torch.library.register_autograd("torchpd::contact_step", _refuse_contact_backward, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::damping_gradient", _damping_backward, setup_context=_save_damping)
 torch.library.register_autograd("torchpd::next_history", _history_backward, setup_context=_save_history)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)

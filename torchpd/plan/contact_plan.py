@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 FLOOR = 0.1  # least distance that is promised, over the thickness
 _EDGES_PER_THICKNESS = 20.0
-_PAIRS_PER_TRIANGLE = 8
+_PAIRS_PER_TRIANGLE = 16  # two layers that lie on each other have 11
 
 
 @dataclass(frozen=True, eq=False)

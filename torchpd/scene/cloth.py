@@ -40,7 +40,7 @@ class Cloth(Body):
     (Bergou et al. 2006) and their total area A. The factor 1 / A makes a cylinder cost kb / 2 times its curvature
     squared per area, where 3 / A is three times too stiff. Grids of right triangles are 14 to 22 % too soft.
 
-    Vertices meet `Ground` and `Sphere` without thickness. A sheet does not collide with itself or other bodies.
+    Vertices meet `Ground` and `Sphere` without thickness. It meets itself and other bodies in scenes with `Contact`.
 
     Args:
         surface: the sheet [m], with edges of one or two triangles. Its vertices are where the sheet starts.

@@ -28,7 +28,8 @@ _STILL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 class Collider(KeyPart):
     """A rigid surface of triangles that moves by hand, for `Contact`.
 
-    Both sides of a triangle keep bodies away, so the surface may be open. Colliders do not touch each other.
+    Both sides of a triangle keep bodies away, so the surface may be open. Colliders do not touch each other. Steps take
+    `targets={collider: pose}`, a pose [7] or [B, 7] at their end; without one the collider stays.
 
     Args:
         mesh: a `TriMesh`, or a `TetMesh` whose boundary is taken, with coordinates [m] about the origin of the pose.
@@ -84,7 +85,7 @@ Member: TypeAlias = Body | Collider
 class Contact(KeyPart):
     """Keeps surfaces of triangles apart: those of bodies, of colliders, and of each body with itself.
 
-    Surfaces rest `thickness` apart and do not cross. The surface of a solid is the boundary of its mesh, whatever is
+    Surfaces rest `thickness` apart and do not cross, however few iterations a step has: docs/contact.md. The surface of a solid is the boundary of its mesh, whatever is
     embedded in it. Bodies that take no part pass through all others. A vertex that a `Tie` holds does not meet the
     triangles and edges that end at the corners of what holds it, nor do its own meet those corners.
 
@@ -101,10 +102,15 @@ class Contact(KeyPart):
             Parts of a body that rest nearer than twice that have half of their distance at rest. None: a twentieth of
             the mean edge, the least of all bodies and colliders.
         capacity: most pairs of a vertex and a triangle, or of two edges, that an environment may have near each other
-            in a step. None: 8 per triangle.
+            in a step. None: 16 per triangle.
 
     Example:
-        >>> scene = Scene(cloth, table, Contact(friction=0.4))
+        >>> box = torchpd.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
+        >>> cubes = [Solid(box.translated((0, y, 0)), youngs=1e5, density=1e3) for y in (0, 0.12)]
+        >>> scene = Scene(*cubes, Ground(), Gravity(), Contact(friction=0.4))
+        >>> sim = Simulator(scene)
+        >>> state, info = sim(sim.rest_state(), return_info=True)
+        >>> info.contact_gap  # [1] least distance over the thickness
     """
 
     bodies: tuple[Member, ...]

@@ -1,4 +1,4 @@
-"""Targets of a step, as rows of the material: pins and spheres at its end; activations, pressures and wind in it."""
+"""Targets of a step: pins, spheres and colliders at its end, activations, pressures and wind in it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _check_precision(name: str, value: Tensor, like: Tensor) -> None:
 
 
 class Anchors:
-    """The pins, spheres, fibres and loads of a scene, keyed by `id`, which torch.compile guards."""
+    """The pins, spheres, fibres, loads and colliders of a scene, keyed by `id`, which torch.compile guards."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -54,6 +54,7 @@ class Anchors:
         self.fibres = {id(part): scene.stencil_ranges(part)["fibre"] for part in scene.fibres}
         self.pressures = {id(part): number for number, part in enumerate(scene.pressures)}
         self.wind = None if scene.wind is None else id(scene.wind)
+        self.colliders = {id(part): number for number, part in enumerate(scene.colliders)}
         self.pinned = sum(len(pin.vertices) for pin in scene.pins)
 
     def __reduce__(self) -> tuple[type[Anchors], tuple[Scene]]:
@@ -105,13 +106,13 @@ class Anchors:
                 name, rows = "fibre_length", self.fibres[id(part)]
                 assert contraction is not None
                 value = self._lengths(value, contraction[rows], batch, fix)
-            elif id(part) in self.pressures or id(part) == self.wind:
+            elif id(part) in self.pressures or id(part) in self.colliders or id(part) == self.wind:
                 continue
             else:
                 raise ValueError(
-                    f"targets: this {type(part).__name__} is not a Pin, Sphere, Fibres, Pressure or Wind of the scene; "
-                    "parts go by identity: a pickled or loaded simulator has its own in sim.scene.pins, "
-                    "sim.scene.spheres, sim.scene.fibres, sim.scene.pressures and sim.scene.wind"
+                    f"targets: this {type(part).__name__} is not a Pin, Sphere, Fibres, Pressure, Wind or Collider of "
+                    "the scene; parts go by identity: a pickled or loaded simulator has its own in sim.scene.pins, "
+                    "sim.scene.spheres, sim.scene.fibres, sim.scene.pressures, sim.scene.wind and sim.scene.colliders"
                 )
             axis = -1 if name == "fibre_length" else -2
             placed[name] = _overwrite(placed.get(name, material[name]), rows, value, axis)
@@ -130,6 +131,24 @@ class Anchors:
             elif id(part) == self.wind:
                 placed["wind"] = self._checked("targets of a Wind", value, batch, [(3,)], placed["wind"], fix)
         return placed
+
+    def place_colliders(self, targets: Targets | None, poses: Tensor) -> Tensor | None:
+        """Poses of the colliders [B, C, 7] with `targets` put in, quaternions normalised; None without a target."""
+        given = targets if isinstance(targets, Mapping) else {}
+        moved = {part: value for part, value in given.items() if id(part) in self.colliders}
+        for part, value in moved.items():
+            value = self._checked("targets of a Collider", value, len(poses), [(7,)], poses)
+            length = value[..., 3:].norm(dim=-1, keepdim=True)
+            # reading values is cheap on the CPU, where alone colliders are; a traced step has none
+            if not torch.compiler.is_compiling() and not bool(((length > 0.0) & value.isfinite()).all()):
+                raise ValueError(
+                    "targets of a Collider must be finite poses (x, y, z, qw, qx, qy, qz) whose quaternion is not "
+                    f"zero, got {value.tolist()}; (1, 0, 0, 0) turns nothing"
+                )
+            number = self.colliders[id(part)]
+            pose = torch.cat([value[..., :3], value[..., 3:] / length], dim=-1).unsqueeze(-2)
+            poses = _overwrite(poses, slice(number, number + 1), pose, -2)
+        return poses if moved else None
 
     def _lengths(self, activation: Tensor, contraction: Tensor, batch: int, fix: str) -> Tensor:
         """Stretches without tension [n] or [.., n] of fibres: 1 - contraction activation, at least 0."""

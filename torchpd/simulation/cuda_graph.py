@@ -46,6 +46,10 @@ class CapturedStep:
         *,
         report: bool,
     ) -> None:
+        if sim.body_contact is not None:
+            raise RuntimeError(
+                "capture: the scene must have no Contact, whose steps run on the CPU alone; call step_ or rollout"
+            )
         if sim.device.type != "cuda":
             raise RuntimeError(
                 f"capture: the simulator must be on a GPU for a CUDA graph, got {sim.device}: move it with "

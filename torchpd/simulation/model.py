@@ -39,6 +39,7 @@ from .settings import (
     NO_STEP,
     SETTINGS,
     Configuration,
+    check_contact,
     check_iterations,
     choose,
     choose_again,
@@ -47,7 +48,7 @@ from .settings import (
     prepare,
     reconfigure,
 )
-from .state import History, HistoryState, State
+from .state import ContactHistory, History, HistoryState, State, history_of
 from .state_checks import (
     check_adjoint,
     check_batch,
@@ -62,9 +63,12 @@ from .surface_loads import SurfaceLoads
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from .body_contact import BodyContact
+
 __all__ = ["Model"]
 
 _PIN_STIFFNESS = CORE_ROWS.index("pin_stiffness")
+_FLOW_WIDTH = 10  # of `History.flow`
 
 
 class _TuningResult(Protocol):
@@ -91,6 +95,7 @@ class Model(nn.Module):
     wind: Tensor
     material_names: tuple[str, ...]  # trainable arrays of the scene, in the order of the tables
     loads: SurfaceLoads | None  # None without pressure or wind
+    body_contact: BodyContact | None = None  # None without `Contact`
     progress: bool = True  # whether bars show while a large scene compiles, for another device too
 
     @check_arguments("Simulator")
@@ -113,7 +118,8 @@ class Model(nn.Module):
         if not isinstance(scene, Scene):
             raise TypeError(f"Simulator: scene must be a Scene, got {type(scene).__name__}")
         if device is not None:  # before a large scene is compiled
-            check_target_device(lambda probe: probe.to(device), torch.empty(0, dtype=dtype))
+            target = check_target_device(lambda probe: probe.to(device), torch.empty(0, dtype=dtype))
+            check_contact(scene, device=target.device)
         self.scene = scene
         self._time_step = check_time_step(time_step, dtype)
         self.iterations = DEFAULT_ITERATIONS if iterations is None else iterations
@@ -125,6 +131,7 @@ class Model(nn.Module):
         self._kernel = check_kernel(kernel)
         self._batch = check_batch(batch)
         self._adjoint = check_adjoint(adjoint)
+        check_contact(scene, solver=given, adjoint=adjoint)
         self.progress = progress
         values = scene.values()
         report_resolution(scene, dtype)
@@ -132,6 +139,10 @@ class Model(nn.Module):
         self.pinned = values.pinned
         self._rest_guard, self._pin_guard, self._notices = MutationGuard(), MutationGuard(), Notices(self, scene)
         with persistent_tensors():
+            if values.contact is not None:
+                from .body_contact import BodyContact  # scenes without contact load nothing of it
+
+                self.body_contact = BodyContact.of(values, dtype)
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
             contraction = self.anchors.contraction
@@ -420,17 +431,27 @@ class Model(nn.Module):
     @property
     def keeps_history(self) -> bool:
         """Whether a step leaves more than positions and velocities, so that states are a `HistoryState`."""
+        return self.body_contact is not None or self._flows
+
+    @property
+    def _flows(self) -> bool:
+        """Whether the history has material of plastic solids."""
         return any(name in self.material_names for name in History._fields)
 
-    def history_at_rest(self) -> History | None:
+    def history_at_rest(self) -> History | ContactHistory | None:
         """The history of a new state, with or without a batch; None where the scene keeps none."""
-        return History(*(getattr(self, name) for name in History._fields)) if self.keeps_history else None
+        own = [getattr(self, name) for name in History._fields] if self._flows else []
+        if self.body_contact is None:
+            return History(*own) if own else None
+        (flow,) = own or [self.rest_positions.new_zeros(0, _FLOW_WIDTH)]
+        return ContactHistory(*self.body_contact.history, flow.detach())
 
     def with_history(self, material: list[Tensor], state: State | HistoryState | Tensor) -> list[Tensor]:
         """The material with the history of a checked state; positions alone have that of a new state."""
-        if isinstance(state, Tensor) or not self.keeps_history:
+        if isinstance(state, Tensor) or not self._flows:
             return material
-        own = dict(zip(HISTORY_PLACES, state[2], strict=True))  # type: ignore[misc]
+        history = history_of(state[2])  # type: ignore[misc]
+        own = dict(zip(HISTORY_PLACES, (getattr(history, name) for name in History._fields), strict=True))
         return [own[place].contiguous() if place in own else array for place, array in enumerate(material)]
 
     def _checked_rest(self) -> Tensor:
@@ -467,6 +488,8 @@ class Model(nn.Module):
         if wanted.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"Simulator: dtype must be torch.float32 or torch.float64, got {wanted.dtype}")
         check_time_step(self.time_step, wanted.dtype)
+        check_contact(self.scene, device=wanted.device)
+        contact = None if self.body_contact is None else self.body_contact.to(wanted.dtype)
         choice, ends = self.choice, {self.device.type, wanted.device.type}
         # widening does not restore the digits that float32 lost, and "meta" has none
         loses_positions = wanted.dtype != self.dtype or self.device.type == "meta"
@@ -478,6 +501,8 @@ class Model(nn.Module):
                 new = moved(self.compiled, wanted.dtype, wanted.device)
             super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
             self._take(new)
+            if contact is not None:
+                self.body_contact = contact
             if self.loads is not None:
                 self.loads = SurfaceLoads.of(self.scene, wanted.dtype, wanted.device)
             if loses_positions:

@@ -25,13 +25,14 @@ __all__ = ["Notices", "warn_of_scene"]
 
 _ROUNDINGS = 10.0  # machine epsilons of a position that a contact may be violated by
 _PLANES, _SPHERES, _GRAVITY = (CORE_ROWS.index(name) for name in ("planes", "spheres", "gravity"))
-_ALONE = "bodies do not collide with each other: move them apart, or separate them by Ground and Sphere"
+_ALONE = "bodies do not collide without Contact: add Contact() to the scene, or move them apart"
+_INVERTED, _MISSING = 6, 8  # columns of the rows of a report
 
 
 def warn_of_scene(scene: Scene) -> None:
     """Warn of bodies that overlap at rest, and of spheres that fit through the meshes of sheets and rods."""
     _say_small_spheres(scene)
-    if len(scene.solids) > 1:
+    if len(scene.solids) > 1 and _may_pass(scene):
         _say_overlaps(scene, find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
 
 
@@ -53,7 +54,8 @@ def _say_small_spheres(scene: Scene) -> None:
 
 
 def _say_overlaps(scene: Scene, found: list[Overlap], where: str) -> None:
-    """Warn of pairs of solids, by their numbers among all bodies."""
+    """Warn of pairs of solids that pass through each other, by their numbers among all bodies."""
+    found = [one for one in found if not all(_takes_part(scene, scene.solids[n]) for n in (one.first, one.second))]
     if found:
         numbers = [number for number, body in enumerate(scene.bodies) if isinstance(body, Solid)]
         pairs = ", ".join(
@@ -61,6 +63,16 @@ def _say_overlaps(scene: Scene, found: list[Overlap], where: str) -> None:
         )
         more = f" and {len(found) - 3} pairs more" if len(found) > 3 else ""
         warn_user(f"Simulator: bodies {pairs}{more} overlap {where}, and {_ALONE}", SceneWarning)
+
+
+def _may_pass(scene: Scene) -> bool:
+    """Whether some solid takes no part in a `Contact`."""
+    return not all(_takes_part(scene, solid) for solid in scene.solids)
+
+
+def _takes_part(scene: Scene, solid: Solid) -> bool:
+    contact = scene.contact
+    return contact is not None and (not contact.bodies or any(solid is one for one in contact.bodies))
 
 
 class Notices:
@@ -121,7 +133,7 @@ class Notices:
         scene = self._looked_at(owner, positions)
         if scene is None:
             return
-        inverted = rows[:, -1]
+        inverted = rows[:, _INVERTED]
         if "inverted" not in self._said and bool((inverted > 0).any()):
             self._said.add("inverted")
             worst, tets = int(inverted.argmax()), sum(len(solid.mesh.tets) for solid in scene.solids)
@@ -131,8 +143,26 @@ class Notices:
                 "stay folded, in a converged step",
                 SceneWarning,
             )
-        if len(scene.solids) > 1 and "overlap" not in self._said:
+        if len(scene.solids) > 1 and _may_pass(scene) and "overlap" not in self._said:
             self._look_for_overlaps(scene, positions.detach())
+
+    def after_contact(self, owner: object, positions: Tensor, rows: Tensor) -> None:
+        """Warn once of an environment whose step was taken back, by rows [B, 10]."""
+        scene = None if "capacity" in self._said else self._looked_at(owner, positions)
+        if scene is None:
+            return
+        missing = rows[:, _MISSING]
+        if bool((missing > 0.0).any()):
+            self._said.add("capacity")
+            worst, capacity = int(missing.argmax()), owner.body_contact.plan.capacity  # type: ignore[attr-defined]
+            need = capacity + int(missing[worst])
+            warn_user(
+                f"Simulator: environment {worst} has {need} pairs of surfaces near each other in a step, more than the "
+                f"{capacity} of its Contact. Its step was taken back: positions, velocities and history stay as before "
+                f"(info.contact_overflow). Make the scene with Contact(capacity={2 * need}), or let fewer surfaces "
+                "come near each other",
+                SceneWarning,
+            )
 
     def _look_for_overlaps(self, scene: Scene, positions: Tensor) -> None:
         """Check the first environment in which boxes overlap; at the 1st, 2nd, 4th, 8th ... such report."""

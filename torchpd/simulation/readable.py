@@ -64,6 +64,14 @@ class Readable(Model):
         own = self.loads.forces((positions, state[1]), named["masses"], self.time_step, values)
         return own if forces is None else forces + own
 
+    def poses_at(self, state: State | HistoryState, targets: Targets | None) -> Tensor | None:
+        """Poses of the colliders [B, C, 7] at the end of a step from a checked state; None: they stay."""
+        if self.body_contact is None:
+            return None
+        if isinstance(targets, Mapping):
+            self.body_contact.check_transforms(*targets.values())
+        return self.anchors.place_colliders(targets, state[2][0])  # type: ignore[misc]
+
     def load_values(self, targets: Targets | None, batch: int) -> dict[str, Tensor]:
         """The arrays `pressure` and `wind` of a step, those that the scene has."""
         own = {row.name: getattr(self, row.name) for row in LOAD_ROWS if row.name in self.material_names}
@@ -92,7 +100,7 @@ class Readable(Model):
         *,
         about: Tensor | None = None,
     ) -> ContactForces:
-        """Forces of grounds and spheres on the vertices [N] in the step from `state` to `after`.
+        """Forces of grounds and spheres on the vertices [N] in the step from `state` to `after`; not with `Contact`.
 
         They are the part of the objective's gradient at `after` that contacts can supply: normal forces, and friction
         up to Coulomb's bound. If several colliders hold a vertex, normal forces are fitted to the gradient, and
@@ -117,6 +125,11 @@ class Readable(Model):
             >>> contacts = sim.contact_forces(state, after)
             >>> contacts.bodies[cube].force  # [B, 3] N, of a cube at rest its weight, upwards
         """
+        if self.body_contact is not None:
+            raise RuntimeError(
+                "contact_forces: the scene must have no Contact, whose forces it would give to grounds and spheres; "
+                "after.history.forces [B, M, 4] N has those between surfaces"
+            )
         return contact_forces(self.scene, self.checked_call(state, after, forces, targets), about)
 
     def reactions(
@@ -161,6 +174,22 @@ class Readable(Model):
         check_environments("state", len(positions), rows)
         return stress(self.scene, positions, rows)
 
+    def check(self, state: State | HistoryState) -> None:
+        """Refuse a state that no step takes: its shapes, and surfaces of `Contact` that cross or touch.
+
+        A step checks no positions. What a simulator returns is free of crossings; check states of your own once.
+
+        Args:
+            state: as in `forward`.
+
+        Raises:
+            ValueError: names the environment, and the edge and triangle that cross, or the sides that touch.
+        """
+        self.check_state(state)
+        self.positions_of(state)
+        if self.body_contact is not None:
+            self.body_contact.check(state)
+
     def plastic_strain(self, state: HistoryState) -> dict[Solid, Tensor]:
         """Flow alpha [B, E] that the tetrahedra of every plastic solid have accumulated. Differentiable.
 
@@ -170,7 +199,7 @@ class Readable(Model):
             state: a `HistoryState`.
         """
         self.check_state(state)
-        if not self.keeps_history:
+        if not self._flows:
             return {}
         return plastic_strain(self.scene, named_material(self.with_history(self.material(), state))["flow"])
 

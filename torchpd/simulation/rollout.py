@@ -14,7 +14,7 @@ from tqdm.auto import tqdm
 from ..common.checks import STEPS_DIFFER
 from ..plan.material import CORE_ROWS
 from ..scene.targets import Anchors, Targets
-from .state import History, HistoryState, HistoryTrack, State, Track
+from .state import HistoryState, HistoryTrack, State, Track, history_of
 from .surface_loads import SurfaceLoads
 
 if TYPE_CHECKING:
@@ -54,6 +54,8 @@ class Steps(Protocol):
         self, state: State | HistoryState, forces: Tensor | None, targets: Targets | None, material: list[Tensor]
     ) -> Tensor | None: ...
 
+    def poses_at(self, state: State | HistoryState, targets: Targets | None) -> Tensor | None: ...
+
     def track(self, *found: Tensor) -> Track | HistoryTrack: ...
 
     def advance(
@@ -66,6 +68,7 @@ class Steps(Protocol):
         every: int,
         inertial: bool,
         report: bool,
+        poses: Tensor | None = None,
     ) -> tuple[Tensor, ...]: ...
 
 
@@ -132,6 +135,7 @@ def _in_chunks(
             every=every,
             inertial=call.inertial,
             report=call.report and recorded,
+            poses=sim.poses_at(state, targets),
         )
         if recorded:
             chunks.append(chunk)
@@ -149,7 +153,7 @@ def _reached(positions: Tensor, velocities: Tensor, _rows: Tensor, *history: Ten
     """The last state of a chunk."""
     if not history:
         return State(positions[-1], velocities[-1])
-    return HistoryState(positions[-1], velocities[-1], History(*(array[-1] for array in history)))
+    return HistoryState(positions[-1], velocities[-1], history_of(array[-1] for array in history))
 
 
 def _changes(sim: Steps, call: Rollout) -> bool:

@@ -18,7 +18,8 @@ from ..estimate.solver_choice import TOLERANCE, Choice, choose_solver, warn_of_f
 from ..plan.compiled import CompiledScene
 from ..plan.kernel_choice import check_kernel
 from ..plan.placement import is_suitable, move_plan, plan_for_device, plan_for_solver, recompile_plan
-from ..scene.solvers import Chebyshev, Solver, check_solver
+from ..scene.scene import Scene
+from ..scene.solvers import Chebyshev, Jacobi, Solver, check_solver
 from .state_checks import check_adjoint, check_batch
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "NO_STEP",
     "SETTINGS",
     "Configuration",
+    "check_contact",
     "check_iterations",
     "choose",
     "choose_again",
@@ -54,6 +56,29 @@ class Configuration(CompiledScene):
     checked_time_steps: tuple[float, float]  # range of time steps [s] that needs no further check
 
 
+def check_contact(
+    scene: Scene, *, solver: Solver | None = None, adjoint: str = "solver", device: torch.device | None = None
+) -> None:
+    """Refuse settings that a scene with `Contact` cannot have."""
+    if scene.contact is None:
+        return
+    if not isinstance(solver, Chebyshev | Jacobi | None):
+        raise TypeError(
+            f"Simulator: solver must be Chebyshev or Jacobi in a scene with Contact, got {type(solver).__name__}; "
+            "leave it out, or remove Contact"
+        )
+    if adjoint != "solver":
+        raise ValueError(
+            f'Simulator: adjoint must be "solver" in a scene with Contact, whose steps have no gradient, got '
+            f"{adjoint!r}; leave it out"
+        )
+    if device is not None and device.type != "cpu":
+        raise RuntimeError(
+            f"Simulator: device must be the CPU in a scene with Contact, got {device}; contact between bodies has no "
+            "kernels there: leave device out, or remove Contact"
+        )
+
+
 def is_auto(solver: object) -> bool:
     """Whether a solver is "auto"."""
     return isinstance(solver, str) and solver == "auto"
@@ -76,11 +101,16 @@ def _with_kernel(now: Configuration, kernel: str) -> Configuration:
 
 
 def _with_solver(now: Configuration, solver: Any) -> Configuration:
-    return choose(now, None) if is_auto(solver) else _solved_by(now, check_solver(solver, now.device))
+    if is_auto(solver):
+        return choose(now, None)
+    checked = check_solver(solver, now.device)
+    check_contact(now.scene, solver=checked)
+    return _solved_by(now, checked)
 
 
 def _with_adjoint(now: Configuration, adjoint: str) -> Configuration:
-    now = replace(now, adjoint=check_adjoint(adjoint))
+    check_contact(now.scene, adjoint=check_adjoint(adjoint))
+    now = replace(now, adjoint=adjoint)
     if is_suitable(now):
         return now
     check_has_values("adjoint", now.device)

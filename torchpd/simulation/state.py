@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, overload
 
 import torch
@@ -14,14 +15,25 @@ from ..common.reprs import by_sizes
 if TYPE_CHECKING:
     from ..scene.targets import Targets
 
-__all__ = ["History", "HistoryState", "HistoryTrack", "Info", "State", "StepCall", "Track", "named_state"]
+__all__ = [
+    "ContactHistory",
+    "History",
+    "HistoryState",
+    "HistoryTrack",
+    "Info",
+    "State",
+    "StepCall",
+    "Track",
+    "history_of",
+    "named_state",
+]
 
 
 class State(NamedTuple):
     """Positions and velocities of all vertices, in the order of the meshes, bodies one after another.
 
     `torch.save` takes it, alone or in a checkpoint, and `torch.load` returns it where torchpd is imported. Scenes with
-    plastic solids have a `HistoryState`.
+    plastic solids or `Contact` have a `HistoryState`.
     """
 
     positions: Tensor  # [B, V, 3] m
@@ -29,7 +41,7 @@ class State(NamedTuple):
 
     def to(self, *args: Any, **kwargs: Any) -> State:
         """The state on another device or in another precision, as `Tensor.to`."""
-        return _mapped(self, lambda tensor: tensor.to(*args, **kwargs))
+        return _mapped(self, lambda tensor: _moved(tensor, *args, **kwargs))
 
     def clone(self) -> State:
         """A contiguous copy, which `step_` may overwrite."""
@@ -53,7 +65,7 @@ class State(NamedTuple):
 
 
 class History(NamedTuple):
-    """What a step leaves for the next one, besides positions and velocities."""
+    """What a step leaves for the next one in a scene with plastic solids, besides positions and velocities."""
 
     flow: Tensor  # [B, P, 10] of plastic tetrahedra: Fp, row by row, and alpha (see `Plastic`)
 
@@ -61,8 +73,23 @@ class History(NamedTuple):
         return by_sizes(self, self.flow, "records", "batch", "plastic")
 
 
+class ContactHistory(NamedTuple):
+    """What a step leaves for the next one in a scene with `Contact`, besides positions and velocities.
+
+    Forces start the solve of the next step. A key names a pair of the simulator's surfaces; -1 is none.
+    """
+
+    poses: Tensor  # [B, C, 7] actual poses of the colliders: x, y, z in m, and a quaternion qw, qx, qy, qz
+    keys: Tensor  # [B, M] int64 of pairs with forces, M = `Contact.capacity`; all -1: no forces, as in a new state
+    forces: Tensor  # [B, M, 4] N: along the normal, and the vector of friction
+    flow: Tensor  # [B, P, 10] as in `History`, of no tetrahedra without plastic solids
+
+    def __repr__(self) -> str:
+        return by_sizes(self, self.forces, "records", "batch", "pairs")
+
+
 class HistoryState(NamedTuple):
-    """The state of a scene with plastic solids: positions, velocities and history.
+    """The state of a scene with plastic solids or `Contact`: positions, velocities and history.
 
     `Simulator.rest_state` makes one; steps take and return it as scenes without history do a `State`. For a state of
     one's own: `HistoryState(x, v, sim.rest_state(len(x)).history)`.
@@ -70,11 +97,11 @@ class HistoryState(NamedTuple):
 
     positions: Tensor  # [B, V, 3] m
     velocities: Tensor  # [B, V, 3] m/s
-    history: History
+    history: History | ContactHistory
 
     def to(self, *args: Any, **kwargs: Any) -> HistoryState:
         """The state on another device or in another precision, as `Tensor.to`."""
-        return _mapped(self, lambda tensor: tensor.to(*args, **kwargs))
+        return _mapped(self, lambda tensor: _moved(tensor, *args, **kwargs))
 
     def clone(self) -> HistoryState:
         """A contiguous copy, which `step_` may overwrite."""
@@ -100,7 +127,19 @@ def _mapped(state: _Some, function: Callable[[Tensor], Tensor]) -> _Some:
     """The state with a function applied to each of its tensors."""
     whole: tuple[Any, ...] = state
     kind: Callable[..., _Some] = type(state)
-    return kind(*(function(part) if isinstance(part, Tensor) else History(*map(function, part)) for part in whole))
+    return kind(*(function(part) if isinstance(part, Tensor) else history_of(map(function, part)) for part in whole))
+
+
+def history_of(arrays: Iterable[Tensor]) -> History | ContactHistory:
+    """A history with named parts, from its arrays in their order."""
+    parts = tuple(arrays)
+    return History(*parts) if len(parts) == len(History._fields) else ContactHistory(*parts)
+
+
+def _moved(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    """`Tensor.to`, which leaves whole numbers whole: they are keys."""
+    moved = tensor.to(*args, **kwargs)
+    return moved if tensor.is_floating_point() else tensor.to(moved.device)
 
 
 def _dense_copy(tensor: Tensor) -> Tensor:
@@ -112,13 +151,13 @@ def named_state(state: Any) -> State | HistoryState:
     if len(state) == len(State._fields):
         return State(*state)
     positions, velocities, history = state
-    return HistoryState(positions, velocities, History(*history))
+    return HistoryState(positions, velocities, history_of(history))
 
 
 def _has_history(state: Any) -> bool:
     """Whether the third part, if there is one, is a history or a tuple or list of its parts."""
     return len(state) == len(State._fields) or (
-        isinstance(state[2], (tuple, list)) and len(state[2]) == len(History._fields)
+        isinstance(state[2], (tuple, list)) and len(state[2]) in (len(History._fields), len(ContactHistory._fields))
     )
 
 
@@ -141,6 +180,11 @@ def _where(state: _Some, condition: Any, other: Any) -> _Some:
         )
     if not isinstance(other, (tuple, list)) or len(other) != len(state) or not _has_history(other):
         raise TypeError(f"{kind.__name__}.where: other must be a {kind.__name__}, got {type(other).__name__}")
+    if isinstance(state, HistoryState) and len(state.history) != len(other[2]):
+        wanted, came = type(state.history).__name__, type(history_of(other[2])).__name__
+        raise TypeError(
+            f"{kind.__name__}.where: other must be a {kind.__name__} with a {wanted}, got one with a {came}"
+        )
     theirs_of = _tensors_by_name(other)
     for name, mine in _tensors_by_name(state).items():
         theirs = theirs_of[name]
@@ -154,9 +198,8 @@ def _where(state: _Some, condition: Any, other: Any) -> _Some:
                 f"{kind.__name__}.where: other must have {name} {list(mine.shape)}, or those of one environment, got "
                 f"{list(theirs.shape)}"
             )
-    chosen = condition[:, None, None]
     rest = iter(theirs_of.values())
-    return _mapped(state, lambda mine: torch.where(chosen, mine, next(rest)))
+    return _mapped(state, lambda mine: torch.where(condition.view(-1, *[1] * (mine.dim() - 1)), mine, next(rest)))
 
 
 class Info(NamedTuple):
@@ -177,11 +220,17 @@ class Info(NamedTuple):
             q A_0 <= A <= s A_0. A_0 is the matrix of `Simulator.prepare_solver`.
         inverted: tetrahedra with det F <= 0 at the end of the step. A body may rest with some, converged, in a folded
             minimum of its energy. -1 unless requested.
-
+        contact_gap: least distance of two surfaces of `Contact` over their thickness at the end of the step, among
+            pairs that are near each other; inf without any. 1 where surfaces rest, less where the solve is unfinished.
+        contact_overflow: pairs that `Contact.capacity` lacks. Where it is positive, positions, velocities and history
+            stay as before the step. 0 without `Contact`.
+        held_back: largest distance that a pinned vertex or a vertex of a `Collider` stays behind its target because
+            bodies are in the way [m]. 0 without `Contact`.
     The residual is (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). Here r is the part of grad E [N] that
     neither pins nor contacts balance. f_i = a_i (u_i - s_i) is the force of inertia, weight and springs on vertex i,
     and e_i that of its elements. S x is the sum of stiffness times position (csrc/solver/report.h), so 4 eps |S x|
-    bounds the rounding that no iteration removes.
+    bounds the rounding that no iteration removes. With `Contact` it is not subtracted, and r is also without the forces
+    between bodies.
 
     If all forces are below that bound, the residual is 0 and says nothing: see docs/limits.md and use float64 there.
     The residual weighs short waves, so the error of positions may be larger or smaller. It ignores a contact that
@@ -194,14 +243,22 @@ class Info(NamedTuple):
     restarts: Tensor
     converged: Tensor
     rho: Tensor
-    inverted: Tensor = torch.tensor(-1)  # for older files, which lack it
+    inverted: Tensor = torch.tensor(-1)  # for older files, which lack it and the next
+    contact_gap: Tensor = torch.tensor(math.inf)
+    contact_overflow: Tensor = torch.tensor(0)
+    held_back: Tensor = torch.tensor(0.0)
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """Build it from rows [..., 7] of the ops; files from before `inverted` have 6 columns."""
+        """Build it from rows of a step [..., 7], with `Contact` [..., 10]; files without `inverted` have 6 columns."""
         residual, energy, iterations, restarts, converged, rho, *counted = rows.unbind(-1)
         inverted = counted[0] if counted else torch.full_like(rho, -1.0)
-        return cls(residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long())
+        of_step = residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long()
+        if len(counted) < 4:
+            gap, overflow = torch.full_like(rho, math.inf), torch.zeros_like(inverted, dtype=torch.int64)
+            return cls(*of_step, gap, overflow, torch.zeros_like(rho))
+        gap, missing, held_back = counted[1:]
+        return cls(*of_step, gap, missing.long(), held_back)
 
     def __repr__(self) -> str:
         try:
@@ -262,17 +319,17 @@ class Track(NamedTuple):
 
 
 class HistoryTrack(NamedTuple):
-    """Recorded states of a rollout of a scene with plastic solids, without its start."""
+    """Recorded states of a rollout of a scene with plastic solids or `Contact`, without its start."""
 
     positions: Tensor  # [T, B, V, 3] m
     velocities: Tensor  # [T, B, V, 3] m/s
     info: Info  # [T, B], of the last step before each record
-    history: History  # [T, B, ...]
+    history: History | ContactHistory  # [T, B, ...]
 
     def state(self, record: int = -1) -> HistoryState:
         """One record as a state to continue from."""
         positions, velocities, *history = _record(self, record, self.positions, self.velocities, *self.history)
-        return HistoryState(positions, velocities, History(*history))
+        return HistoryState(positions, velocities, history_of(history))
 
     def __repr__(self) -> str:
         return by_sizes(self, self.positions, "records", "batch", "vertices")
@@ -287,7 +344,7 @@ def _record(track: Track | HistoryTrack, record: int, *arrays: Tensor) -> list[T
         raise IndexError(f"{type(track).__name__}.state: {there}, got {record}") from None
 
 
-for _kind in (Info, State, Track, History, HistoryState, HistoryTrack):
+for _kind in (Info, State, Track, History, ContactHistory, HistoryState, HistoryTrack):
     # pickles name a class by its module: now torchpd, formerly torchpd.state
     _kind.__module__ = "torchpd"
     # allow-lists of torch.load and torch.export.save; these classes hold tensors and run nothing

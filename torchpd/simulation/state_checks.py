@@ -16,7 +16,7 @@ from ..common.checks import check_like, check_whole, expand_shared, to_full_prec
 from ..common.memory import chunks
 from ..common.warn import warn_user
 from ..scene.scene import Scene
-from .state import History, HistoryState, State
+from .state import ContactHistory, History, HistoryState, State, history_of
 
 __all__ = [
     "ADJOINTS",
@@ -126,7 +126,12 @@ def _number_or_nan(value: Any) -> float:
 
 
 def check_state(
-    rest: Tensor, state: State | HistoryState, history: History | None, *, forces: Tensor | None, fix: str
+    rest: Tensor,
+    state: State | HistoryState,
+    history: History | ContactHistory | None,
+    *,
+    forces: Tensor | None,
+    fix: str,
 ) -> Tensor | None:
     """Implementation of `Model.check_state`, by the rest positions [V, 3] and history [n, ...] of a simulator."""
     if not _is_state(state, history):
@@ -138,7 +143,7 @@ def check_state(
     if state[0].dim() == 0:  # the batch is read before an op checks the shape
         raise ValueError(f"positions must be [B, {len(rest)}, 3], got []")
     check_like("velocities", state[1], state[0], "m/s")
-    _check_history(rest, state, history)
+    _check_history(state, history)
     if forces is None:
         return None
     forces = expand_shared(to_full_precision(forces, state[0]), state[0].shape)
@@ -146,7 +151,9 @@ def check_state(
     return forces
 
 
-def positions_of(rest: Tensor, state: State | HistoryState | Tensor, history: History | None, name: str) -> Tensor:
+def positions_of(
+    rest: Tensor, state: State | HistoryState | Tensor, history: History | ContactHistory | None, name: str
+) -> Tensor:
     """Implementation of `Model.positions_of`, by the rest positions [V, 3] and history [n, ...] of a simulator."""
     alone = isinstance(state, Tensor)
     if not (alone or _is_state(state, history)):
@@ -160,17 +167,17 @@ def positions_of(rest: Tensor, state: State | HistoryState | Tensor, history: Hi
         raise ValueError(f"{name} must be [B, {len(rest)}, 3], got {list(positions.shape)}")
     if not isinstance(state, Tensor):
         check_like("velocities", state[1], positions, "m/s")
-        _check_history(rest, state, history)
+        _check_history(state, history)
     return positions
 
 
-def _check_history(rest: Tensor, state: State | HistoryState, history: History | None) -> None:
+def _check_history(state: State | HistoryState, history: History | ContactHistory | None) -> None:
     if history is None:
         return
-    given = History(*state[2])  # type: ignore[misc]
+    given = history_of(state[2])  # type: ignore[misc]
     for name, own, array in zip(history._fields, history, given, strict=True):
-        _check_kind(rest, f"history.{name}", array)
-        shape = (len(state[0]), *own.shape[-2:])
+        _check_kind(own, f"history.{name}", array)
+        shape = (len(state[0]), *own.shape[-(1 if name == "keys" else 2) :])
         if array.shape != shape:
             raise ValueError(f"history.{name} must be {list(shape)}, as rest_state() has it, got {list(array.shape)}")
 
@@ -183,11 +190,13 @@ def _check_kind(own: Tensor, name: str, positions: Tensor) -> None:
         )
 
 
-def _wanted(history: History | None) -> str:
-    return "a State" if history is None else "a HistoryState, in a scene with plastic solids"
+def _wanted(history: History | ContactHistory | None) -> str:
+    if history is None:
+        return "a State"
+    return f"a HistoryState, in a scene with {'plastic solids' if isinstance(history, History) else 'Contact'}"
 
 
-def _is_state(state: Any, history: History | None) -> bool:
+def _is_state(state: Any, history: History | ContactHistory | None) -> bool:
     count = 2 if history is None else 3
     if not (isinstance(state, (tuple, list)) and len(state) == count):
         return False

@@ -17,11 +17,12 @@ from ..plan.material import check_environments, environments_of_material, named_
 from ..scene.targets import Targets
 from .readable import Readable
 from .rollout import PerStep, Rollout, run_rollout
-from .state import History, HistoryState, HistoryTrack, Info, State, StepCall, Track
+from .state import HistoryState, HistoryTrack, Info, State, StepCall, Track, history_of
 
 __all__ = ["Stepper"]
 
 _ops = torch.ops.torchpd
+_OF_CONTACT = 3  # columns of `Contact` in the rows of a report
 
 
 class Stepper(Readable):
@@ -35,7 +36,7 @@ class Stepper(Readable):
     def rest_state(self, batch: int | None = None) -> State:
         """The rest positions with zero velocities [batch, V, 3], and the history of a scene that keeps one.
 
-        A `State`, or a `HistoryState` in scenes with plastic solids.
+        A `State`, or a `HistoryState` in scenes with plastic solids or `Contact`.
 
         Args:
             batch: environments; by default one for each environment of the material.
@@ -51,8 +52,10 @@ class Stepper(Readable):
         state = State(positions, torch.zeros_like(positions))
         if history is None:
             return state
-        kept = History(*(array.expand(count, *array.shape[-2:]).clone() for array in history))
-        # for type checkers scenes without plastic solids are the rule
+        flow = history.flow.expand(count, *history.flow.shape[-2:])
+        others = [array.expand(count, *array.shape) for array in history[:-1]]
+        kept = history_of(array.clone() for array in (*others, flow))
+        # for type checkers scenes without history are the rule
         return cast(State, HistoryState(*state, kept))
 
     def _after(self, positions: Tensor, velocities: Tensor, material: list[Tensor]) -> Any:
@@ -60,7 +63,31 @@ class Stepper(Readable):
         if not self.keeps_history:
             return State(positions, velocities)
         kept = _ops.next_history(positions, material, list(self.plan.arrays), time_step=self.time_step)
-        return HistoryState(positions, velocities, History(*kept))
+        return HistoryState(positions, velocities, history_of(kept))
+
+    def _stepped(
+        self,
+        state: State | HistoryState,
+        forces: Tensor | None,
+        given: Tensor | None,
+        material: list[Tensor],
+        poses: Tensor | None,
+        *,
+        inertial: bool,
+        report: bool,
+    ) -> tuple[Any, Tensor]:
+        """The state after a step from a checked one, and the rows of its report."""
+        settings, plan = self.step_settings(inertial=inertial, report=report), list(self.plan.arrays)
+        if self.body_contact is None:
+            positions, velocities, rows = _ops.step(state[0], state[1], forces, given, material, plan, **settings)
+            after = self._after(positions, velocities, material)
+        else:
+            _refuse_start(given)
+            after, rows = self.body_contact.step(state, forces, poses, material, plan, settings)
+            self._notices.after_contact(self, after[0], rows)
+        if report and not torch.compiler.is_compiling():
+            self._notices.after(self, after[0], rows)
+        return after, rows
 
     def forward(
         self,
@@ -76,15 +103,16 @@ class Stepper(Readable):
 
         Gradients come from the implicit adjoint at the end of the step, with friction, and hold for all arguments but
         `start`. Their error follows that of the step: docs/limits.md#friction-and-gradients. Forward mode and
-        `torch.func.grad` are not provided.
+        `torch.func.grad` are not provided, nor is any gradient in scenes with `Contact`.
 
         Args:
-            state: positions and velocities [B, V, 3] [m, m/s]; in scenes with plastic solids a `HistoryState`.
+            state: positions and velocities [B, V, 3] [m, m/s]; with plastic solids or `Contact` a `HistoryState`.
             forces: on the vertices [B, V, 3] [N], or [V, 3] or [1, V, 3] for all environments; constant in the step.
             targets: of pins and spheres at the end of the step [m], by part; or one tensor [P, 3] or [B, P, 3] for all
                 pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
                 `Fibres` take their activation during the step, a number [], [B], [n] or [B, n] for n fibres.
-                A `Pressure` takes its overpressure [] or [B] Pa, `Wind` its velocity [3] or [B, 3] m/s.
+                A `Pressure` takes its overpressure [] or [B] Pa, `Wind` its velocity [3] or [B, 3] m/s. A `Collider`
+                takes its pose [7] or [B, 7], see there; one without a target stays.
             start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
                 The first two are moved along rigid motions and out of contacts. A body that planes would squeeze there
                 starts from x.
@@ -100,20 +128,9 @@ class Stepper(Readable):
         given, inertial = _first_iterate(start, state[0])
         refuse_forward_mode(state[0], state[1], forces, *material)
         self._notices.before(self, state, material, self.time_step, report=return_info)
-        positions, velocities, rows = _ops.step(
-            state[0],
-            state[1],
-            forces,
-            given,
-            material,
-            list(self.plan.arrays),
-            **self.step_settings(inertial=inertial, report=return_info),
-        )
-        after = self._after(positions, velocities, material)
-        if not return_info:
-            return after
-        self._notices.after(self, positions, rows)
-        return after, Info.from_rows(rows)
+        poses = self.poses_at(state, targets)
+        after, rows = self._stepped(state, forces, given, material, poses, inertial=inertial, report=return_info)
+        return (after, Info.from_rows(rows)) if return_info else after
 
     @torch.no_grad()
     def step_(
@@ -130,7 +147,8 @@ class Stepper(Readable):
         If an exception such as Ctrl-C ends it, each environment is either at the start or at the end of the step.
 
         Args:
-            info: rows [B, 7] float64 to fill in, see `Info.from_rows`; None leaves out residual, energy and inverted.
+            info: rows [B, 7] float64 to fill in, with `Contact` [B, 10], see `Info.from_rows`; None leaves out
+                residual, energy and inverted.
         """
         forces = self.check_state(state, forces=forces)
         if _requires_grad(state[0], state[1], *(state[2] if len(state) > 2 else ())):
@@ -139,7 +157,7 @@ class Stepper(Readable):
             )
         if not (info is None or isinstance(info, Tensor)):
             raise TypeError(
-                f"step_: info must be None or a float64 tensor {[len(state[0]), INFO_WIDTH]} to fill in, got "
+                f"step_: info must be None or a float64 tensor {[len(state[0]), self._info_width]} to fill in, got "
                 f"{type(info).__name__}"
             )
         given, inertial = _first_iterate(start, state[0])
@@ -147,6 +165,9 @@ class Stepper(Readable):
         if self.loads is not None:
             forces = self.forces_at(state, forces, targets, material)
         self._notices.before(self, state, material, self.time_step, report=info is not None)
+        if self.body_contact is not None:
+            self._step_in_contact(state, forces, given, material, self.poses_at(state, targets), inertial, info)
+            return
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
             state[0],
@@ -163,6 +184,35 @@ class Stepper(Readable):
                 kept.copy_(new)
         if info is not None:
             self._notices.after(self, state[0], info)
+
+    @property
+    def _info_width(self) -> int:
+        """Columns of the rows of a report."""
+        return INFO_WIDTH if self.body_contact is None else INFO_WIDTH + _OF_CONTACT
+
+    def _step_in_contact(
+        self,
+        state: State | HistoryState,
+        forces: Tensor | None,
+        given: Tensor | None,
+        material: list[Tensor],
+        poses: Tensor | None,
+        inertial: bool,
+        info: Tensor | None,
+    ) -> None:
+        """`step_` in a scene with `Contact`."""
+        shape = (len(state[0]), self._info_width)
+        if info is not None and (info.shape != shape or info.dtype != torch.float64):
+            raise ValueError(
+                f"step_: info must be float64 {list(shape)} in a scene with Contact, got {info.dtype} "
+                f"{list(info.shape)}"
+            )
+        after, rows = self._stepped(state, forces, given, material, poses, inertial=inertial, report=info is not None)
+        old = (state[0], state[1], *state[2])  # type: ignore[misc]
+        for kept, new in zip(old, (after[0], after[1], *after[2]), strict=True):
+            kept.copy_(new)
+        if info is not None:
+            info.copy_(rows)
 
     @check_arguments("Simulator.rollout")
     def rollout(
@@ -181,7 +231,7 @@ class Stepper(Readable):
         """Advance a state by many time steps and record some of them.
 
         A scene with pressure or wind takes step by step, with the forces at the start of each. So does a scene with
-        plastic solids, whose track is a `HistoryTrack`.
+        plastic solids or `Contact`, whose track is a `HistoryTrack`.
 
         A constant target of a sphere with a velocity moves on with it. If a function gives centres without velocities,
         these are the displacements since the step before. The sphere then starts from its place in the scene, at step 0
@@ -222,8 +272,11 @@ class Stepper(Readable):
         every: int,
         inertial: bool,
         report: bool,
+        poses: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
         """Take steps from a checked state and forces in one call of the op; spheres start where `material` has them.
+
+        Colliders end at `poses` [B, C, 7], or stay.
 
         Returns:
             Positions and velocities [steps // every, B, V, 3], rows for `Info.from_rows`, and those of the history.
@@ -232,7 +285,8 @@ class Stepper(Readable):
         refuse_forward_mode(state[0], state[1], forces, *material)
         self._notices.before(self, state, material, self.time_step, report=report)
         if self.keeps_history:
-            return self._advance_once(state, forces, material, steps=steps, inertial=inertial, report=report)
+            after, rows = self._stepped(state, forces, None, material, poses, inertial=inertial, report=report)
+            return tuple(array[None][:steps] for array in (after[0], after[1], rows, *after[2]))
         # the adjoint needs every state, so the op has a derivative only with every=1
         thinned = every > 1 and torch.is_grad_enabled() and _requires_grad(state[0], state[1], forces, *material)
         found = _ops.rollout(
@@ -254,33 +308,13 @@ class Stepper(Readable):
                 self._notices.after(self, reached, row)
         return positions, velocities, rows
 
-    def _advance_once(
-        self,
-        state: State | HistoryState,
-        forces: Tensor | None,
-        material: list[Tensor],
-        *,
-        steps: int,
-        inertial: bool,
-        report: bool,
-    ) -> tuple[Tensor, ...]:
-        """`advance` in a scene that keeps a history: one step, or none."""
-        settings = self.step_settings(inertial=inertial, report=report)
-        positions, velocities, rows = _ops.step(
-            state[0], state[1], forces, None, material, list(self.plan.arrays), **settings
-        )
-        if report and not torch.compiler.is_compiling():
-            self._notices.after(self, positions, rows)
-        kept = self._after(positions, velocities, material).history
-        return tuple(array[None][:steps] for array in (positions, velocities, rows, *kept))
-
     def track(self, *found: Tensor) -> Track | HistoryTrack:
         """The track of what `advance` returned."""
         positions, velocities, rows, *history = found
         info = Info.from_rows(rows)
         if not history:
             return Track(positions, velocities, info)
-        return HistoryTrack(positions, velocities, info, History(*history))
+        return HistoryTrack(positions, velocities, info, history_of(history))
 
     # ---- energies
 
@@ -342,6 +376,14 @@ class Stepper(Readable):
             targets: as in `forward`.
         """
         return step_gradient(self.checked_call(state, after, forces, targets))
+
+
+def _refuse_start(given: Tensor | None) -> None:
+    if given is not None:
+        raise ValueError(
+            'start must be "velocity" or "inertial" in a scene with Contact, got positions, which others may be in '
+            "the way of; leave it out"
+        )
 
 
 def _first_iterate(start: str | Tensor, positions: Tensor) -> tuple[Tensor | None, bool]:

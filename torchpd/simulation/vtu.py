@@ -189,7 +189,7 @@ def _own_fields(
     scene, positions = compiled.scene, state.positions[chosen]
     named = dict(compiled.named)
     if isinstance(state, HistoryState):
-        named |= state.history._asdict()
+        named["flow"] = state.history.flow
     material = {name: _of_environment(name, array, chosen) for name, array in named.items()}
     rest = positions.new_tensor(scene.rest_positions)
     points = {"displacement": positions - rest, "velocity": state.velocities[chosen]}
@@ -200,7 +200,7 @@ def _own_fields(
         found = stress(scene, positions[None], rows)
         cells["stress"] = "tetra", found.cauchy[0].flatten(1)
         cells["von_mises"] = "tetra", found.von_mises[0]
-    if isinstance(state, HistoryState):
+    if isinstance(state, HistoryState) and state.history.flow.shape[-2]:
         flows = plastic_strain(scene, state.history.flow[chosen][None])
         none = [positions.new_zeros(len(solid.mesh.tets)) for solid in scene.solids]
         own = [flows[solid][0] if solid in flows else zeros for solid, zeros in zip(scene.solids, none, strict=True)]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchpd.reference.contact.crossings import crossings, linking_number, orientations
+from torchpd.geometry.crossings import orientations
+from torchpd.reference.contact.crossings import crossings, linking_number
 from torchpd.reference.contact.surfaces import Surfaces
 
 

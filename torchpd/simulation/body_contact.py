@@ -1,0 +1,153 @@
+"""Contact between bodies in a simulator: its constant arrays, its step, poses of colliders, and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..plan.contact_plan import ContactPlan, contact_plan
+from ..plan.contact_start import check_start
+from ..scene.contact import placed
+from ..scene.scene import SceneValues
+from .state import ContactHistory, HistoryState, State
+
+__all__ = ["BodyContact"]
+
+_ops = torch.ops.torchpd
+_GAP, _MISSING, _PINS_HELD_BACK = 0, 1, -1  # columns of the numbers of an environment, csrc/cpu/contact/views.h
+_RESIDUAL = 0  # column of the rows of a step
+
+
+@dataclass(frozen=True, eq=False)
+class BodyContact:
+    """The contact of a scene compiled for a precision."""
+
+    plan: ContactPlan
+    arrays: list[Tensor]  # of the op, csrc/binding/contact_ops.h
+    history: tuple[Tensor, Tensor, Tensor]  # poses, keys and forces of a new state, without a batch
+
+    @staticmethod
+    def of(values: SceneValues, dtype: torch.dtype) -> BodyContact:
+        """Compile the contact of a scene; refuse rest positions that cross or touch."""
+        plan = contact_plan(values)
+        made = BodyContact._in_precision(plan, dtype)
+        check_start(plan, plan.rest, torch.finfo(dtype).eps, "Simulator: rest positions")
+        return made
+
+    def to(self, dtype: torch.dtype) -> BodyContact:
+        """The same in another precision, whose rounding must be below the thickness."""
+        return BodyContact._in_precision(self.plan, dtype)
+
+    @staticmethod
+    def _in_precision(plan: ContactPlan, dtype: torch.dtype) -> BodyContact:
+        plan.check_resolution(dtype)
+        poses = torch.tensor(plan.poses, dtype=dtype).reshape(-1, 7)
+        keys = torch.tensor(-1).expand(plan.capacity)
+        forces = torch.zeros((), dtype=dtype).expand(plan.capacity, 4)
+        return BodyContact(plan, _arrays(plan, dtype), (poses, keys, forces))
+
+    def step(
+        self,
+        state: State | HistoryState,
+        forces: Tensor | None,
+        poses: Tensor | None,
+        material: list[Tensor],
+        plan: list[Tensor],
+        settings: dict[str, Any],
+    ) -> tuple[HistoryState, Tensor]:
+        """The next state, and rows [B, 10] for `Info.from_rows`.
+
+        Args:
+            state: a checked one, whose flow is in the material.
+            forces: on the vertices [B, V, 3] N.
+            poses: of colliders at the end of the step [B, C, 7]; None: they stay.
+            material: in the order of the ops.
+            plan: arrays of the compiled scene.
+            settings: of a step, by name.
+        """
+        self.check_transforms(state[0], state[1], *material)
+        _refuse_gradients(state, forces, poses, material)
+        before = ContactHistory(*state[2])  # type: ignore[misc]
+        history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.contiguous()]
+        wanted = history[0] if poses is None else poses.contiguous()
+        positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
+            state[0], state[1], forces, wanted, history, material, plan, self.arrays, **settings
+        )
+        flow = before.flow
+        if flow.shape[-2]:
+            (after,) = _ops.next_history(positions, material, plan, time_step=settings["time_step"])
+            # the step of an environment whose pairs exceed the capacity is taken back
+            flow = torch.where((numbers[:, _MISSING] > 0)[:, None, None], flow, after)
+        held_back = torch.cat([numbers[:, _PINS_HELD_BACK, None], held.double()], dim=1).amax(dim=1)
+        own = torch.stack([numbers[:, _GAP], numbers[:, _MISSING], held_back], dim=1)
+        # the residual of other scenes would count forces between bodies as unbalanced
+        rows = torch.cat([numbers[:, _UNBALANCED, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
+        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
+
+    @staticmethod
+    def check_transforms(*given: Tensor) -> None:
+        """Refuse `torch.func.vmap` and its kin, where not traced: the op refuses them there."""
+        if torch.compiler.is_compiling():
+            return
+        if any(map(torch._C._functorch.is_functorch_wrapped_tensor, given)):
+            raise RuntimeError(
+                "a step with Contact must not be transformed by torch.func or vmap, got mapped arguments; "
+                "put the environments in the batch of a state instead: sim.rest_state(batch)"
+            )
+
+    def check(self, state: State | HistoryState) -> None:
+        """Refuse a state in which surfaces of an environment cross or touch, or whose poses are none."""
+        poses = state[2][0].double().cpu().numpy()  # type: ignore[misc]
+        rounding = torch.finfo(state[0].dtype).eps
+        lengths = np.linalg.norm(poses[..., 3:], axis=-1)
+        if not np.all(np.abs(lengths - 1.0) <= 64.0 * rounding):
+            raise ValueError(
+                f"history.poses must have unit quaternions (qw, qx, qy, qz), got lengths of {lengths.min():.6g} to "
+                f"{lengths.max():.6g}; divide by the length"
+            )
+        plan = self.plan
+        number = plan.collider[plan.collider >= 0]
+        for environment, places in enumerate(state[0].detach().double().cpu().numpy()):
+            world = placed(poses[environment][number], plan.points)
+            check_start(
+                plan, np.concatenate([places, world]), rounding, f"check: positions of environment {environment}"
+            )
+
+
+def _arrays(plan: ContactPlan, dtype: torch.dtype) -> list[Tensor]:
+    """Arrays of the op in their order."""
+
+    def whole(array: Any) -> Tensor:
+        return torch.tensor(np.asarray(array), dtype=torch.int32)
+
+    def real(array: Any) -> Tensor:
+        return torch.tensor(np.asarray(array), dtype=dtype)
+
+    sizes = [len(plan.self_contact), len(plan.poses), plan.capacity]
+    surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
+    trees = [plan.vertex_tree.order, plan.triangle_tree.order, plan.edge_tree.order]
+    friction = plan.friction if len(plan.friction) > 1 else plan.friction[0]  # arrays of one column are [n]
+    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, friction, [plan.thickness]]
+    keys = torch.tensor(plan.near.keys, dtype=torch.int64)
+    return [*map(whole, [sizes, *surfaces, *trees]), keys, *map(real, reals)]
+
+
+def _refuse_gradients(
+    state: State | HistoryState, forces: Tensor | None, poses: Tensor | None, material: list[Tensor]
+) -> None:
+    if not torch.is_grad_enabled():
+        return
+    named = {"positions": state[0], "velocities": state[1], "forces": forces, "poses of colliders": poses}
+    named |= {f"history.{name}": array for name, array in zip(ContactHistory._fields, state[2], strict=True)}  # type: ignore[misc]
+    name = next((name for name, array in named.items() if array is not None and array.requires_grad), None)
+    if name is None and any(array.requires_grad for array in material):
+        name = "material or targets"
+    if name is not None:
+        raise RuntimeError(
+            f"a step with Contact must not require gradients, got {name} that do; its derivative is not provided: "
+            "detach() them, or step under torch.no_grad()"
+        )
