@@ -144,11 +144,11 @@ def test_rings_stay_linked(iterations: int) -> None:
 
 @pytest.mark.parametrize("friction", [0.0, 0.3, 1.0])
 def test_a_twisted_strip(friction: float) -> None:
-    """Ten turns within .6 s, in knots of its own: finite, and pins held back by what is left."""
-    run = watched(twisted_strip((20, 4), seconds=0.6, friction=friction), 34, 8)
+    """Ten turns within .5 s, in knots of its own: finite, and pins held back by what is left."""
+    run = watched(twisted_strip((16, 3), seconds=0.5, friction=friction), 29, 8)
     assert run.crossed == 0
     assert run.finite
-    assert max(result.pairs for result in run.steps) > 1000
+    assert max(result.pairs for result in run.steps) > 500
     assert all(result.pins_held_back < 0.06 for result in run.steps)
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from .limit import Balls, HalfSpaces, Walls, largest_shares
 from .scene import ContactScene
-from .screws import screw_between, screw_pose
+from .screws import Screw, screw_between, screw_pose
 
 __all__ = ["Hands"]
 
@@ -23,7 +24,11 @@ class Hands:
     goals: Tensor  # [C, 7]
     targets: Tensor  # [N, 3] m at the step's end; rows of free vertices have no meaning
 
-    @property
+    @cached_property
+    def _screw(self) -> Screw:
+        return screw_between(self.poses, self.goals)
+
+    @cached_property
     def group(self) -> Tensor:
         """Group [N] of each vertex that moves by hand: its collider, or a pin's own; -1 for free ones."""
         pins = self.scene.surfaces.kinematic & (self.scene.collider < 0)
@@ -41,7 +46,7 @@ class Hands:
 
     def moved(self, shares: Tensor) -> Tensor:
         """Poses [C, 7] of the colliders after shares [G]."""
-        return screw_pose(screw_between(self.poses, self.goals), shares[: len(self.poses)])
+        return screw_pose(self._screw, shares[: len(self.poses)])
 
     def limited(
         self, free: Tensor, positions: Tensor, spaces: HalfSpaces, balls: Balls, walls: Walls, stuck: Tensor
@@ -53,11 +58,13 @@ class Hands:
         """
         group = self.group
         count = int(group.max()) + 1 if len(group) else 0
-        if not count:
-            return self, free, torch.zeros(len(group), dtype=torch.bool)
+        by_hand = group >= 0
+        if torch.equal(positions[by_hand], self.targets[by_hand]):
+            arrived = torch.where(by_hand[:, None], positions, free)
+            return replace(self, poses=self.goals), arrived, torch.zeros_like(by_hand)
         shares = largest_shares(lambda share: self.placed(positions, share), group, count, spaces, balls, walls, stuck)
         places = self.placed(positions, shares)
-        result = torch.where((group >= 0)[:, None], places, free)
+        result = torch.where(by_hand[:, None], places, free)
         held = torch.cat([shares < 1.0, torch.zeros(1, dtype=torch.bool)])[group]
         return replace(self, poses=self.moved(shares)), result, held
 
