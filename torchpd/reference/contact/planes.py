@@ -64,8 +64,9 @@ def gap_along(normals: Tensor, corners: Tensor, points: int) -> Tensor:
 def candidates(corners: Tensor, points: int, near: Closest, *others: Tensor) -> Tensor:
     """Unit directions [m, k, 3] that may separate the sides; zero where one has no length.
 
-    Between the closest points; the same made orthogonal to the edges that carry them, since rounding turns it by
-    ulp / d, over an edge's length more than the gap; the face's or the common normal; `others` [m, 3].
+    The first is that between the closest points. The second is the same made orthogonal to the edges that carry them:
+    rounding turns it by ulp / d, over an edge's length more than the gap. Then the normal of the face, or the common
+    normal of the edges, and `others` [m, 3].
     """
     own = [near.diff, _squared(corners, points, near), _normals(corners, points, near.diff)]
     among = torch.stack([*own, *others], dim=1)

@@ -115,8 +115,9 @@ def augmented_lagrangian(
 ) -> float:
     """psi [J] of all pairs at gaps `distance` [m] and slips [m, 3], by multipliers and friction bounds as they are.
 
-    psi = (max(0, q)^2 - lambda^2) / 2k + (huber(|lambda_t - k t|) - |lambda_t|^2 / 2) / k with q = lambda + k (r - d),
-    1 / k = sum w^2 / D, and huber(y) = y^2 / 2 up to the bound mu lambda, beyond it mu lambda y - (mu lambda)^2 / 2.
+    psi        = (max(0, q)^2 - lambda^2) / 2k + (huber(|lambda_t - k t|) - |lambda_t|^2 / 2) / k
+    q          = lambda + k (r - d)        1 / k = sum w^2 / D
+    huber(y)   = y^2 / 2 up to the bound b = friction lambda, beyond it b y - b^2 / 2
     """
     yielding = (weights**2 * inverse[pairs.vertices]).sum(dim=1)
     own = yielding > 0.0
