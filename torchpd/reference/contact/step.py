@@ -7,9 +7,9 @@
     search again where a ball was touched, at the earliest five iterations after the last search
 
 Every iterate, and every straight way between two of them, is free of crossings, however few the iterations. Every
-fourth iteration the guard compares E + psi, with psi the augmented Lagrangian by the multipliers of now on both sides.
-A coarse correction of bodies in contact will come after the guard, before the prox, every fourth iteration: its pushes
-go through planes and limit like any x', x_{k-1} shifts alike, and the guard forgets what it knew.
+fourth iteration the guard compares E + psi with that of the last check. psi is the augmented Lagrangian by the list and
+the multipliers of now, on both sides. A coarse correction of bodies in contact will come after the guard, before the
+prox: its pushes go through planes and limit like any x', x_{k-1} shifts alike, and the guard forgets the last check.
 """
 
 from __future__ import annotations
