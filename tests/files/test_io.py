@@ -147,9 +147,10 @@ def test_bodies_of_every_kind_come_back(tmp_path: Path) -> None:
 
 def test_contact_comes_back(tmp_path: Path) -> None:
     """With all its arrays to the bit; contact may come before what it names."""
-    solid, table = pd.Solid(pd.shapes.single_tet(), 1e5), pd.Collider(pd.shapes.box(cells=(1, 1, 1)), friction=0.2)
-    sheet_of, still = pd.Cloth(pd.TriMesh(*sheet()), 1e5, 1e-3, 0.2), {"self_contact": [solid]}
-    other = pd.Collider(table.mesh, pose=(1.0, 2.0, 3.0, 0.3, -0.2, 0.7, 0.1))
+    rigid = pd.shapes.box(cells=(1, 1, 1)).translated((2.0, 0.0, 0.0))
+    solid, table = pd.Solid(pd.shapes.single_tet(), 1e5), pd.Collider(rigid, friction=0.2)
+    sheet_of = pd.Cloth(pd.TriMesh(*sheet()).translated((0.0, 5.0, 0.0)), 1e5, 1e-3, 0.2)
+    other, still = pd.Collider(table.mesh, pose=(-2.0, -2.0, -3.0, 0.3, -0.2, 0.7, 0.1)), {"self_contact": [solid]}
     for number, contact in enumerate(
         (
             pd.Contact(friction=0.3, thickness=1e-3, capacity=77, self_contact=False),

@@ -9,7 +9,7 @@ from runs import noise, plan_of, settings_of, small
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.simulation.state import Info
+from torchpd.ops.registration import INFO_WIDTH
 
 BATCH = 3
 
@@ -23,7 +23,7 @@ def samples(
     x, v = state
     f, direction = noise(x), noise(x, 1)
     still, zero = sim.rest_state(BATCH)
-    info = torch.full((BATCH, len(Info._fields)), float("nan"), dtype=torch.float64, device=device)
+    info = torch.full((BATCH, INFO_WIDTH), float("nan"), dtype=torch.float64, device=device)
     numbers = settings_of(sim)
     matrices = noise(torch.empty(5, 3, 3, dtype=dtype, device=device)) + 2.0 * torch.eye(3, dtype=dtype, device=device)
 

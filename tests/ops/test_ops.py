@@ -141,8 +141,11 @@ def test_elastic_diagonal_refuses_a_gradient() -> None:
 def test_step_allocates_what_it_fills(poisoned: None, dtype: torch.dtype, device: torch.device) -> None:
     for batch in (1, 3, 8, 17):
         sim, state = small(dtype, device, batch)
-        for out in (sim(state, return_info=True), sim.rollout(state, 5, 2, return_info=True)):
-            flat = torch.utils._pytree.tree_leaves(out)
+        after, info = sim(state, return_info=True)
+        track = sim.rollout(state, 5, 2, return_info=True)
+        for out, report in ((after, info), (track[:2], track.info)):
+            assert bool((report.contact_gap == torch.inf).all())  # without Contact
+            flat = torch.utils._pytree.tree_leaves((out, report._replace(contact_gap=report.held_back)))
             assert all(bool(t.isfinite().all()) for t in flat)
 
 

@@ -212,6 +212,16 @@ def test_set_up_times_every_stage(tmp_path: Path) -> None:
     assert all(stage["processor_seconds"] > 0.0 for stage in box["stages"].values())
 
 
+def test_body_contact_times_every_scene(tmp_path: Path) -> None:
+    out = tmp_path / "contact.json"
+    command = [sys.executable, "benchmarks/body_contact.py", "--cells", "2", "--steps", "2", "--out", str(out)]
+    subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    rows = json.loads(out.read_text())["rows"]
+    assert [row["scene"] for row in rows] == ["rest", "stack", "sheet", "apart"]
+    assert [row["triangles"] for row in rows] == [48 + 72, 96, 48 + 288, 96]
+    assert all(row["milliseconds"] > 0.0 < row["milliseconds_without"] for row in rows)
+
+
 @pytest.fixture
 def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmarks are scripts, which find each other in their folder."""

@@ -85,9 +85,10 @@ Member: TypeAlias = Body | Collider
 class Contact(KeyPart):
     """Keeps surfaces of triangles apart: those of bodies, of colliders, and of each body with itself.
 
-    Surfaces rest `thickness` apart and do not cross, however few iterations a step has: docs/contact.md. The surface of a solid is the boundary of its mesh, whatever is
-    embedded in it. Bodies that take no part pass through all others. A vertex that a `Tie` holds does not meet the
-    triangles and edges that end at the corners of what holds it, nor do its own meet those corners.
+    Surfaces rest `thickness` apart and do not cross, however few iterations a step has: docs/contact.md. The surface of
+    a solid is the boundary of its mesh, whatever is embedded in it. Bodies that take no part pass through all others. A
+    vertex that a `Tie` holds does not meet the triangles and edges that end at the corners of what holds it, nor do its
+    own meet those corners.
 
     Friction between two bodies is the geometric mean of their coefficients. `Contact(friction=)` is the coefficient of
     bodies, and of colliders that have none. If only one of the two has a coefficient, that is it, and without any there

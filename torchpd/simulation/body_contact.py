@@ -54,6 +54,7 @@ class BodyContact:
         self,
         state: State | HistoryState,
         forces: Tensor | None,
+        given: Tensor | None,
         poses: Tensor | None,
         material: list[Tensor],
         plan: list[Tensor],
@@ -64,11 +65,17 @@ class BodyContact:
         Args:
             state: a checked one, whose flow is in the material.
             forces: on the vertices [B, V, 3] N.
+            given: first iterate, which is refused.
             poses: of colliders at the end of the step [B, C, 7]; None: they stay.
             material: in the order of the ops.
             plan: arrays of the compiled scene.
             settings: of a step, by name.
         """
+        if given is not None:
+            raise ValueError(
+                'start must be "velocity" or "inertial" in a scene with Contact, got positions, which others may be in '
+                "the way of; leave it out"
+            )
         self.check_transforms(state[0], state[1], *material)
         _refuse_gradients(state, forces, poses, material)
         before = ContactHistory(*state[2])  # type: ignore[misc]

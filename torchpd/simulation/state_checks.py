@@ -22,6 +22,7 @@ __all__ = [
     "ADJOINTS",
     "check_adjoint",
     "check_batch",
+    "check_info",
     "check_positive_number",
     "check_state",
     "check_time_step",
@@ -149,6 +150,14 @@ def check_state(
     forces = expand_shared(to_full_precision(forces, state[0]), state[0].shape)
     check_like("forces", forces, state[0], "N", fix=fix)
     return forces
+
+
+def check_info(info: Tensor, shape: tuple[int, int]) -> None:
+    """Check rows for the report of a step with `Contact`, which Python fills in."""
+    if info.shape != shape or info.dtype != torch.float64:
+        raise ValueError(
+            f"step_: info must be float64 {list(shape)} in a scene with Contact, got {info.dtype} {list(info.shape)}"
+        )
 
 
 def positions_of(

@@ -18,6 +18,7 @@ from ..scene.targets import Targets
 from .readable import Readable
 from .rollout import PerStep, Rollout, run_rollout
 from .state import HistoryState, HistoryTrack, Info, State, StepCall, Track, history_of
+from .state_checks import check_info
 
 __all__ = ["Stepper"]
 
@@ -82,8 +83,7 @@ class Stepper(Readable):
             positions, velocities, rows = _ops.step(state[0], state[1], forces, given, material, plan, **settings)
             after = self._after(positions, velocities, material)
         else:
-            _refuse_start(given)
-            after, rows = self.body_contact.step(state, forces, poses, material, plan, settings)
+            after, rows = self.body_contact.step(state, forces, given, poses, material, plan, settings)
             self._notices.after_contact(self, after[0], rows)
         if report and not torch.compiler.is_compiling():
             self._notices.after(self, after[0], rows)
@@ -201,12 +201,8 @@ class Stepper(Readable):
         info: Tensor | None,
     ) -> None:
         """`step_` in a scene with `Contact`."""
-        shape = (len(state[0]), self._info_width)
-        if info is not None and (info.shape != shape or info.dtype != torch.float64):
-            raise ValueError(
-                f"step_: info must be float64 {list(shape)} in a scene with Contact, got {info.dtype} "
-                f"{list(info.shape)}"
-            )
+        if info is not None:
+            check_info(info, (len(state[0]), self._info_width))
         after, rows = self._stepped(state, forces, given, material, poses, inertial=inertial, report=info is not None)
         old = (state[0], state[1], *state[2])  # type: ignore[misc]
         for kept, new in zip(old, (after[0], after[1], *after[2]), strict=True):
@@ -376,14 +372,6 @@ class Stepper(Readable):
             targets: as in `forward`.
         """
         return step_gradient(self.checked_call(state, after, forces, targets))
-
-
-def _refuse_start(given: Tensor | None) -> None:
-    if given is not None:
-        raise ValueError(
-            'start must be "velocity" or "inertial" in a scene with Contact, got positions, which others may be in '
-            "the way of; leave it out"
-        )
 
 
 def _first_iterate(start: str | Tensor, positions: Tensor) -> tuple[Tensor | None, bool]:
