@@ -22,7 +22,7 @@ from ..common.warn import warn_user
 from ..plan.compiled import CompiledScene
 from ..plan.kernel_costs import iteration_microseconds
 from ..plan.preconditioner import MOST_DIRECT
-from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Multilevel, Solver, check_solver
+from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Solver, check_solver
 from .convergence import (
     FAR_TOO_FEW,
     LANDING_ROOTS,
@@ -215,7 +215,7 @@ def _relaxation(spectrum: Spectrum | None) -> float | None:
 
 def runs(solver: Solver, compiled: CompiledScene) -> bool:
     """Whether there are kernels for the solver on the device of the scene."""
-    if compiled.scene.contact is not None and isinstance(solver, Multilevel):
+    if compiled.scene.contact is not None and not isinstance(solver, Chebyshev | Jacobi):
         return False
     try:
         check_solver(solver, compiled.device)

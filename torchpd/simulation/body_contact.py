@@ -137,8 +137,7 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype) -> list[Tensor]:
     sizes = [len(plan.self_contact), len(plan.poses), plan.capacity]
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     trees = [plan.vertex_tree.order, plan.triangle_tree.order, plan.edge_tree.order]
-    friction = plan.friction if len(plan.friction) > 1 else plan.friction[0]  # arrays of one column are [n]
-    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, friction, [plan.thickness]]
+    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction, [plan.thickness]]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     return [*map(whole, [sizes, *surfaces, *trees]), keys, *map(real, reals)]
 

@@ -187,8 +187,8 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     return run_.is_at_rest() ? change : HUGE_VAL;
   }
 
-  void guard(double twice_energy) {
-    const auto merits = run_.check(0.5 * twice_energy);
+  void guard(double energy) {
+    const auto merits = run_.check(energy);
     Schedule& schedule = schedule_[0];
     schedule.last_energy = merits.known ? merits.before : HUGE_VAL;
     schedule.check(merits.now);
