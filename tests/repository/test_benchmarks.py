@@ -457,3 +457,15 @@ def test_a_cube_slides_or_rests_for_its_gradients() -> None:
     assert rows[1]["slide"] == 0.0
     # which of the two takes longer depends on other programs
     assert all(row["vertices"] == 27 and min(row["forward"], row["both"]) > 0.0 for row in rows)
+
+
+@pytest.mark.usefixtures("on_path")
+def test_nothing_crosses_in_the_first_scenes_of_the_soak() -> None:
+    """Of those, some have pairs; and a start that crosses would be found."""
+    soak = importlib.import_module("contact_soak")
+    rows = [soak.run_scene(number) for number in range(25)]
+    found = soak.summary(rows)
+    assert found["faults"] == []
+    assert found["scenes"] == 25
+    assert found["nearer than the promise"] == found["overflows"] == 0
+    assert found["scenes with pairs"] > 10
