@@ -85,9 +85,10 @@ $(VENV)/requirements.stamp: requirements/dev.txt requirements/lock.txt $(VENV)/b
 	$(PIP) --quiet -r requirements/dev.txt -c requirements/lock.txt
 	@touch $@
 
-# Object files stay in build/, so that ninja compiles only what changed.
+# Object files stay in build/, so that ninja compiles only what changed. It takes the jobs of make for its own, but the
+# pipe to them is closed when it starts.
 $(VENV)/extension.stamp: $(NATIVE_SOURCES) setup.py torchpd/common/toolkit.py $(VENV)/build.stamp
-	$(BIN)/python setup.py --quiet build_ext --inplace
+	env -u MAKEFLAGS $(BIN)/python setup.py --quiet build_ext --inplace
 	@touch $@
 
 $(VENV)/package.stamp: pyproject.toml torchpd/version.py $(VENV)/requirements.stamp | $(VENV)/extension.stamp

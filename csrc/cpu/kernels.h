@@ -1,11 +1,11 @@
-// The compiled physics of one instruction set. Included once by each cpu/isa_*.cpp, after PD_TARGET is set.
+// The compiled physics of one instruction set. Included once by each cpu/isa_*.cpp, after cpu/target.
 #pragma once
 #include "cpu/adjoint/conjugate_gradients.h"
 #include "cpu/adjoint/energy_fields.h"
 #include "cpu/adjoint/system.h"
-#include "cpu/contact/stepper.h"
 #include "cpu/multilevel/newton.h"
 #include "cpu/multilevel/stepper.h"
+#include "cpu/step/clean_registers.h"
 #include "cpu/step/report.h"
 #include "cpu/step/stepper.h"
 
@@ -15,15 +15,6 @@
 #include <vector>
 
 namespace pd::inline PD_TARGET {
-
-// Clears the upper vector registers for code compiled for older instructions; the build turns the compiler's own off.
-struct CleanRegisters {
-  ~CleanRegisters() {
-#if PD_VECTOR_BYTES >= 32
-    _mm256_zeroupper();
-#endif
-  }
-};
 
 // Fewest environments for which lanes run over environments instead of elements.
 constexpr std::int64_t least_batch = 8;
@@ -118,30 +109,9 @@ void step_any(const StepCall<T>& call, int threads) {
   has_contacts ? step_with<true>(call, threads) : step_with<false>(call, threads);
 }
 
-// Environment by environment, each by one thread.
-template <bool HasContacts, class T>
-void contact_step_with(const StepCall<T>& call, const ContactCall<T>& contact, int threads) {
-  using Lanes = Single<T>;
-  std::atomic<std::int64_t> next{0};
-  run_team(int(std::min<std::int64_t>(threads, call.batch)), [&](const Team& team) {
-    const CleanRegisters clean;
-    Workspace<Lanes> work(call);
-    Scratch<Lanes> scratch(call.plan.most_slots);
-    ContactRun<T> run(contact.plan);
-    Approach<T> approach(contact.plan);
-    const Team alone = team.alone();
-    for (std::int64_t e = next++; e < call.batch && !alone.ended(0); e = next++)
-      ContactStepper<T, HasContacts>(call, work, scratch, alone, e, contact, run, approach)
-          .rollout();
-  });
-}
-
+// In a translation unit of its own: cpu/contact/kernels.h.
 template <class T>
-void contact_step_any(const StepCall<T>& call, const ContactCall<T>& contact, int threads) {
-  const bool has_contacts = call.material.planes_count + call.material.spheres_count > 0;
-  has_contacts ? contact_step_with<true>(call, contact, threads)
-               : contact_step_with<false>(call, contact, threads);
-}
+void contact_step_any(const StepCall<T>& call, const ContactCall<T>& contact, int threads);
 
 template <class T>
 void field_any(const FieldCall<T>& call, int threads) {

@@ -1,0 +1,3 @@
+#include "cpu/target/portable.h"
+
+#include "cpu/contact/kernels.h"
