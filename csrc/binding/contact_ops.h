@@ -1,7 +1,7 @@
 // The op of a step with contact between bodies.
 #pragma once
 #include "binding/ops.h"
-#include "cpu/contact/views.h"
+#include "contact/views.h"
 
 #include <cstdint>
 #include <tuple>

@@ -18,7 +18,7 @@ from .state import ContactHistory, HistoryState, State
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_GAP, _MISSING, _PINS_HELD_BACK, _UNBALANCED = 0, 1, 6, 7  # columns in csrc/cpu/contact/views.h
+_GAP, _MISSING, _PINS_HELD_BACK, _UNBALANCED = 0, 1, 6, 7  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 
 
