@@ -91,17 +91,18 @@ class ContactApproach {
     team.groups(plan_.bodies, [&](int b, const auto& group) {
       const int begin = a_.body_begin[b], end = a_.body_end[b];
       double sums[7] = {};
-      group.sum_range(begin, end,
-                      [&](int v, double (&sum)[7]) {
-                        if (plan_.body[v] != b) return;
-                        const double m = double(env_.body.mass[v]);
-                        const Vec3<double> way = wide(a_.target[v]) - wide(a_.place[v]);
-                        sum[0] += m;
-                        add_to(sum + 1, multiply_add(m, wide(a_.place[v]),
-                                                     Vec3<double>{sum[1], sum[2], sum[3]}));
-                        add_to(sum + 4, multiply_add(m, way, Vec3<double>{sum[4], sum[5], sum[6]}));
-                      },
-                      sums);
+      group.sum_range(
+          begin, end,
+          [&](int v, double (&sum)[7]) {
+            if (plan_.body[v] != b) return;
+            const double m = double(env_.body.mass[v]);
+            const Vec3<double> way = wide(a_.target[v]) - wide(a_.place[v]);
+            sum[0] += m;
+            add_to(sum + 1,
+                   multiply_add(m, wide(a_.place[v]), Vec3<double>{sum[1], sum[2], sum[3]}));
+            add_to(sum + 4, multiply_add(m, way, Vec3<double>{sum[4], sum[5], sum[6]}));
+          },
+          sums);
       const double share = sums[0] > 0 ? 1 / sums[0] : 0;
       RigidWay rigid;
       rigid.mass = sums[0];
@@ -147,17 +148,17 @@ class ContactApproach {
     const auto box_of = [&](int v) { return Box<T>{a_.place[v], a_.place[v]}; };
     const auto reach = [&](int v) { return a_.weight[v] + T(0.5) * plan_.thickness; };
     search_.refit(team, box_of, reach);
-    search_.each_boxed(team, box_of, reach, [](int) { return true; },
-                       [&](int, int, ContactPair<T>& pair) {
-                         const int b = plan_.body[pair.vertex[0]];
-                         if (b != plan_.body[pair.vertex[3]] || !a_.own[b]) return;
-                         Vec3<T> start[4], end[4];
-                         pair.corners(a_.place, start);
-                         pair.corners(a_.target, end);
-                         const auto own_reach = [&](int v) { return a_.weight[v]; };
-                         if (!stays_apart(pair, start, end, own_reach, plan_.thickness))
-                           a_.own[b] = 0;
-                       });
+    search_.each_boxed(
+        team, box_of, reach, [](int) { return true; },
+        [&](int, int, ContactPair<T>& pair) {
+          const int b = plan_.body[pair.vertex[0]];
+          if (b != plan_.body[pair.vertex[3]] || !a_.own[b]) return;
+          Vec3<T> start[4], end[4];
+          pair.corners(a_.place, start);
+          pair.corners(a_.target, end);
+          const auto own_reach = [&](int v) { return a_.weight[v]; };
+          if (!stays_apart(pair, start, end, own_reach, plan_.thickness)) a_.own[b] = 0;
+        });
   }
 
   // of vertices of bodies, from `shift`, where the step began; checks come later
@@ -193,17 +194,17 @@ class ContactApproach {
     team.groups(plan_.bodies, [&](int b, const auto& group) {
       const double far = HUGE_VAL;
       double least[6] = {far, far, far, far, far, far};
-      group.least_range(0, plan_.points,
-                        [&](int n, double (&low)[6]) {
-                          const int v = plan_.point[n];
-                          if (plan_.body[v] != b) return;
-                          const Box<T> box = swept(v).widened(bow(v));
-                          const double sides[6] = {double(box.low.x),   double(box.low.y),
-                                                   double(box.low.z),   -double(box.high.x),
-                                                   -double(box.high.y), -double(box.high.z)};
-                          for (int s = 0; s < 6; ++s) low[s] = sides[s] < low[s] ? sides[s] : low[s];
-                        },
-                        least);
+      group.least_range(
+          0, plan_.points,
+          [&](int n, double (&low)[6]) {
+            const int v = plan_.point[n];
+            if (plan_.body[v] != b) return;
+            const Box<T> box = swept(v).widened(bow(v));
+            const double sides[6] = {double(box.low.x),   double(box.low.y),   double(box.low.z),
+                                     -double(box.high.x), -double(box.high.y), -double(box.high.z)};
+            for (int s = 0; s < 6; ++s) low[s] = sides[s] < low[s] ? sides[s] : low[s];
+          },
+          least);
       if (group.leads())
         a_.body_box[b] = {{T(least[0]), T(least[1]), T(least[2])},
                           {T(-least[3]), T(-least[4]), T(-least[5])}};
@@ -216,11 +217,12 @@ class ContactApproach {
     if (meets) search_.refit(team, box_of, reach);
     for (int round = 0; meets && round < share_rounds; ++round) {
       set_limits(team, shares);
-      search_.each_boxed(team, box_of, reach, [](int) { return true; },
-                         [&](int, int, ContactPair<T>& pair) {
-                           if (plan_.body[pair.vertex[0]] != plan_.body[pair.vertex[3]])
-                             visit(pair, round + 1 == share_rounds);
-                         });
+      search_.each_boxed(
+          team, box_of, reach, [](int) { return true; },
+          [&](int, int, ContactPair<T>& pair) {
+            if (plan_.body[pair.vertex[0]] != plan_.body[pair.vertex[3]])
+              visit(pair, round + 1 == share_rounds);
+          });
       const bool changed = numbers.changed != 0;
       team.barrier();
       if (!changed) break;
@@ -276,8 +278,9 @@ class ContactApproach {
       const Vec3<T> way = a_.end[v] - a_.place[v];
       if (way.x != T(0) || way.y != T(0) || way.z != T(0)) a_.moves[plan_.body[v]] = 1;
     });
-    lower_by_walls(team, a_.together, [&](int b) { return a_.moves[b] != 0; },
-                   [&](int v, T s) { return at(v, s); });
+    lower_by_walls(
+        team, a_.together, [&](int b) { return a_.moves[b] != 0; },
+        [&](int v, T s) { return at(v, s); });
     each_between(team, a_.together, [&](const ContactPair<T>& pair, bool last) {
       const int bodies[2] = {plan_.body[pair.vertex[0]], plan_.body[pair.vertex[3]]};
       const bool moves[2] = {a_.moves[bodies[0]] != 0, a_.moves[bodies[1]] != 0};

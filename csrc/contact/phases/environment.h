@@ -35,32 +35,32 @@ struct ContactNumbers {
 // Arrays of an environment. Vertices have the user's numbers, those of colliders last.
 template <class T>
 struct ContactArrays {
-  Vec3<T> *begin, *place, *target, *goal, *shift, *checked, *end;  // [vertices] m
-  Ball<T>* ball;                                                    // [vertices]
-  T *inverse, *weight, *room;                                       // [vertices]
-  unsigned char *held, *cut, *surface;                              // [vertices]
-  int *start, *cursor;              // [vertices + 1]: entries of a vertex in the list of pairs
-  int* entry;                       // [4 capacity]: pair * 4 + corner, in the order of the pairs
-  ContactPair<T>* pair;             // [capacity] in the order of their keys
-  unsigned char* active;            // [capacity]
-  std::int64_t* known_key;          // [capacity] of the list before
-  Multiplier<T>* known_force;       // [capacity]
-  int *owner, *partner;             // [capacity] parts of a pair
-  int* owner_start;                 // [owners + 1] pairs of each vertex, then of each edge
-  int* owner_near;                  // [owners]
-  Box<T>*triangle_box, *edge_box;   // of trees, all levels
-  RigidWay* rigid;                  // [bodies]
-  Box<T>* body_box;                 // [bodies]
-  T *together, *alone, *joint, *limit;      // [bodies] shares of ways
-  int *body_begin, *body_end;       // [bodies] vertices
-  int* group;                       // [bodies]
+  Vec3<T>*begin, *place, *target, *goal, *shift, *checked, *end;  // [vertices] m
+  Ball<T>* ball;                                                  // [vertices]
+  T *inverse, *weight, *room;                                     // [vertices]
+  unsigned char *held, *cut, *surface;                            // [vertices]
+  int *start, *cursor;             // [vertices + 1]: entries of a vertex in the list of pairs
+  int* entry;                      // [4 capacity]: pair * 4 + corner, in the order of the pairs
+  ContactPair<T>* pair;            // [capacity] in the order of their keys
+  unsigned char* active;           // [capacity]
+  std::int64_t* known_key;         // [capacity] of the list before
+  Multiplier<T>* known_force;      // [capacity]
+  int *owner, *partner;            // [capacity] parts of a pair
+  int* owner_start;                // [owners + 1] pairs of each vertex, then of each edge
+  int* owner_near;                 // [owners]
+  Box<T>*triangle_box, *edge_box;  // of trees, all levels
+  RigidWay* rigid;                 // [bodies]
+  Box<T>* body_box;                // [bodies]
+  T *together, *alone, *joint, *limit;  // [bodies] shares of ways
+  int *body_begin, *body_end;           // [bodies] vertices
+  int* group;                           // [bodies]
   unsigned char *own, *pinned, *moves;  // [bodies]
-  Hand<T>* hand;                    // [colliders]
-  Screw<T>* screw;                  // [colliders]
-  T *share, *least, *bound;         // [colliders]
-  int* barred;                      // [colliders]
-  unsigned char* touches;           // [components]
-  T* most;                          // [colliders + 2]: held back, pins held back, least d / r
+  Hand<T>* hand;                        // [colliders]
+  Screw<T>* screw;                      // [colliders]
+  T *share, *least, *bound;             // [colliders]
+  int* barred;                          // [colliders]
+  unsigned char* touches;               // [components]
+  T* most;                              // [colliders + 2]: held back, pins held back, least d / r
   ContactNumbers* numbers;
 };
 
@@ -115,9 +115,9 @@ constexpr int contact_array_pointers = int(sizeof(ContactArrays<float>) / sizeof
 // The deforming vertices of a step, by internal number: four numbers each, but for `inverse` and `inertia`.
 template <class T>
 struct BodyState {
-  const int *order, *component;  // user's number; component that moves rigidly, or -1
-  const T* x;                    // at the start of the step
-  T *u, *before;                 // displacement of the iterate, and of the one before
+  const int *order, *component;    // user's number; component that moves rigidly, or -1
+  const T* x;                      // at the start of the step
+  T *u, *before;                   // displacement of the iterate, and of the one before
   const T *free, *target, *saved;  // of the free iterate; s; before a coarse correction
   const T *inverse, *inertia;      // every `stride` numbers
   const T* mass;                   // by the user's number
@@ -131,7 +131,9 @@ struct BodyState {
     T* p = to + 4 * std::int64_t(i);
     p[0] = value.x, p[1] = value.y, p[2] = value.z;
   }
-  PD_HD Vec3<T> place(int i, const Vec3<T>& displacement) const { return read(x, i) + displacement; }
+  PD_HD Vec3<T> place(int i, const Vec3<T>& displacement) const {
+    return read(x, i) + displacement;
+  }
   PD_HD T inverse_of(int i) const { return inverse[std::int64_t(i) * stride]; }
   PD_HD Vertex<Thread<T>, true> vertex(int i) const {
     return {read(x, i), read(target, i), inertia[std::int64_t(i) * stride], inverse_of(i)};
@@ -172,9 +174,8 @@ struct ContactEnvironment {
   // calls visit(normal, bound, margin) for all half-spaces of a vertex
   template <class Visit>
   PD_HD void each_space(int v, const Visit& visit) const {
-    each_of(v, [&](int p, int corner) {
-      visit_space(a.pair[p].plane, a.pair[p].on_a(corner), visit);
-    });
+    each_of(
+        v, [&](int p, int corner) { visit_space(a.pair[p].plane, a.pair[p].on_a(corner), visit); });
     const T here = place_rounding(a.place[v]), there = place_rounding(a.target[v]),
             margin = here < there ? there : here;
     each_wall(v, a.place[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });

@@ -126,13 +126,14 @@ class ContactSearch {
     team.spread(plan.vertices, [&](int v) { a.room[v] = T(HUGE_VAL), a.cursor[v] = 0; });
     team.spread(env_.owners(), [&](int n) { a.owner_near[n] = 0, a.owner_start[n] = 0; });
     refit(team, box_of, reach);
-    each_boxed(team, box_of, reach, [](int) { return true; },
-               [&](int owner, int, ContactPair<T>& pair) {
-                 measure(pair);
-                 if (!pair.is_within(most, plan.thickness)) return;
-                 for (int v : pair.vertex) lower(a.room + v, pair.near.distance);
-                 a.owner_near[owner] = 1;
-               });
+    each_boxed(
+        team, box_of, reach, [](int) { return true; },
+        [&](int owner, int, ContactPair<T>& pair) {
+          measure(pair);
+          if (!pair.is_within(most, plan.thickness)) return;
+          for (int v : pair.vertex) lower(a.room + v, pair.near.distance);
+          a.owner_near[owner] = 1;
+        });
     team.each(plan.vertices, [&](int v) {
       const Vec3<T> way = a.target[v] - a.place[v];
       const bool held = env_.held(v);
@@ -145,11 +146,12 @@ class ContactSearch {
     });
     const auto radius = [&](int v) { return a.ball[v].radius; };
     const auto each_listed = [&](const auto& visit) {
-      each_boxed(team, box_of, reach, [&](int owner) { return a.owner_near[owner] != 0; },
-                 [&](int owner, int other, ContactPair<T>& pair) {
-                   measure(pair);
-                   if (pair.is_within(radius, plan.thickness)) visit(owner, other);
-                 });
+      each_boxed(
+          team, box_of, reach, [&](int owner) { return a.owner_near[owner] != 0; },
+          [&](int owner, int other, ContactPair<T>& pair) {
+            measure(pair);
+            if (pair.is_within(radius, plan.thickness)) visit(owner, other);
+          });
     };
     each_listed([&](int owner, int) { ++a.owner_start[owner]; });
     team.scan(a.owner_start, env_.owners());
@@ -161,14 +163,15 @@ class ContactSearch {
     });
     if (count > 0) {
       team.each(env_.owners(), [&](int n) { a.owner_near[n] = 0; });
-      each_boxed(team, box_of, reach,
-                 [&](int owner) { return a.owner_start[owner] < a.owner_start[owner + 1]; },
-                 [&](int owner, int other, ContactPair<T>& pair) {
-                   measure(pair);
-                   if (!pair.is_within(radius, plan.thickness)) return;
-                   place_in_order(a.partner + a.owner_start[owner], a.owner_near[owner], other);
-                   a.owner[a.owner_start[owner] + a.owner_near[owner]++] = owner;
-                 });
+      each_boxed(
+          team, box_of, reach,
+          [&](int owner) { return a.owner_start[owner] < a.owner_start[owner + 1]; },
+          [&](int owner, int other, ContactPair<T>& pair) {
+            measure(pair);
+            if (!pair.is_within(radius, plan.thickness)) return;
+            place_in_order(a.partner + a.owner_start[owner], a.owner_near[owner], other);
+            a.owner[a.owner_start[owner] + a.owner_near[owner]++] = owner;
+          });
     }
     team.each(count, [&](int p) {
       ContactPair<T>& pair = a.pair[p];

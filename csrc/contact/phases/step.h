@@ -84,9 +84,8 @@ class ContactSteps {
     });
     double none[2];
     go(team, false, none);
-    team.each(body_.vertices, [&](int i) {
-      BodyState<T>::write(body_.before, i, BodyState<T>::read(body_.u, i));
-    });
+    team.each(body_.vertices,
+              [&](int i) { BodyState<T>::write(body_.before, i, BodyState<T>::read(body_.u, i)); });
   }
 
   // At the end bodies that touch no other are corrected again.
@@ -110,7 +109,7 @@ class ContactSteps {
   // An iteration of a step, from the free iterate without contact. `energy`: E at the iterate, if the schedule checks it.
   // `sums`: squares of the change, and of the displacement from the target, with a tolerance.
   struct Iteration {
-    T c;           // theta omega
+    T c;  // theta omega
     bool guards, measures;
     double energy;
   };
@@ -133,8 +132,8 @@ class ContactSteps {
       team.spread(body_.vertices, [&](int i) {
         Vec3<T>& target = a_.target[body_.order[i]];
         const Vec3<T> u = target - BodyState<T>::read(body_.x, i);
-        target = body_.place(
-            i, body_.vertex(i).project(env_.walls, u, BodyState<T>::read(body_.u, i)));
+        target =
+            body_.place(i, body_.vertex(i).project(env_.walls, u, BodyState<T>::read(body_.u, i)));
       });
       team.barrier();
     }
@@ -151,7 +150,8 @@ class ContactSteps {
   template <class Team>
   PD_HD void finish(const Team& team, T* forces) const {
     const int pairs = env_.numbers().pairs;
-    team.each(plan_.colliders + 2, [&](int n) { a_.most[n] = n < plan_.colliders + 1 ? T(0) : T(HUGE_VAL); });
+    team.each(plan_.colliders + 2,
+              [&](int n) { a_.most[n] = n < plan_.colliders + 1 ? T(0) : T(HUGE_VAL); });
     team.each(pairs, [&](int p) {
       ContactPair<T>& pair = a_.pair[p];
       look(pair);
@@ -203,8 +203,7 @@ class ContactSteps {
         write_force(to, n, -1, T(0), {T(0), T(0), T(0)});
       }
     });
-    if (overflows)
-      team.spread(3 * plan_.vertices, [&](int n) { to.vertex_forces[n] = T(0); });
+    if (overflows) team.spread(3 * plan_.vertices, [&](int n) { to.vertex_forces[n] = T(0); });
     team.spread(plan_.colliders, [&](int c) {
       const Pose<T> pose = overflows ? Hand<T>::read(env_.poses + 7 * c) : a_.hand[c].pose;
       Hand<T>::write(pose, to.poses + 7 * c);
@@ -280,23 +279,24 @@ class ContactSteps {
     ContactNumbers& numbers = env_.numbers();
     const bool checked = numbers.checked != 0;
     double sums[2] = {numbers.checked_energy, energy};
-    team.sum(pairs,
-             [&](int p, double (&sum)[2]) {
-               const ContactPair<T>& pair = a_.pair[p];
-               const T yielding = pair.yielding(a_.inverse);
-               const auto psi = [&](const Vec3<T>* places, const Closest<T>& at) {
-                 return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction,
-                                             at.distance,
-                                             pair.template slip<const Vec3<T>*>(places, a_.begin, at));
-               };
-               if (checked) {
-                 Vec3<T> corner[4];
-                 pair.corners(a_.checked, corner);
-                 sum[0] += psi(a_.checked, closest_points(pair.edges, corner));
-               }
-               sum[1] += psi(a_.place, pair.near);
-             },
-             sums);
+    team.sum(
+        pairs,
+        [&](int p, double (&sum)[2]) {
+          const ContactPair<T>& pair = a_.pair[p];
+          const T yielding = pair.yielding(a_.inverse);
+          const auto psi = [&](const Vec3<T>* places, const Closest<T>& at) {
+            return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction,
+                                        at.distance,
+                                        pair.template slip<const Vec3<T>*>(places, a_.begin, at));
+          };
+          if (checked) {
+            Vec3<T> corner[4];
+            pair.corners(a_.checked, corner);
+            sum[0] += psi(a_.checked, closest_points(pair.edges, corner));
+          }
+          sum[1] += psi(a_.place, pair.near);
+        },
+        sums);
     team.spread(plan_.vertices, [&](int v) { a_.checked[v] = a_.place[v]; });
     team.once([&] { numbers.checked_energy = energy, numbers.checked = 1; });
     return {sums[0], sums[1], checked};
@@ -330,8 +330,9 @@ class ContactSteps {
         pair.corners(a_.shift, between);
         pair.corners(a_.begin, before);
         const T beta = T(1) / (c * row_bound(pair, a_.weight, a_.inverse));
-        pair.force = advance(pair.force, beta, pair.thickness, pair.friction, pair.normal,
-                             combined(pair.near.weight, between), combined(pair.near.weight, before));
+        pair.force =
+            advance(pair.force, beta, pair.thickness, pair.friction, pair.normal,
+                    combined(pair.near.weight, between), combined(pair.near.weight, before));
       });
       push(team, c, false, sweep + 1 == contact_sweeps);
     }
@@ -435,12 +436,9 @@ class ContactSteps {
     const Vec3<T> from = a_.place[v];
     if (env_.held(v)) {
       const Vec3<T> goal = a_.goal[v], way = goal - from;
-      const auto at = [&](T share) {
-        return share < T(1) ? multiply_add(share, way, from) : goal;
-      };
-      const T share = env_.is_stuck(v) ? T(0) : largest_share<T>([&](T s) {
-        return is_allowed_at(v, at(s));
-      });
+      const auto at = [&](T share) { return share < T(1) ? multiply_add(share, way, from) : goal; };
+      const T share =
+          env_.is_stuck(v) ? T(0) : largest_share<T>([&](T s) { return is_allowed_at(v, at(s)); });
       if (share > T(0)) a_.place[v] = at(share);
       if (share < T(1)) cut(v);
       return;
@@ -493,13 +491,11 @@ class ContactSteps {
         a_.share[c] = T(0.5) * (a_.least[c] + a_.bound[c]);
       });
       try_shares(false);
-      team.each(plan_.colliders, [&](int c) {
-        (a_.barred[c] ? a_.bound[c] : a_.least[c]) = a_.share[c];
-      });
+      team.each(plan_.colliders,
+                [&](int c) { (a_.barred[c] ? a_.bound[c] : a_.least[c]) = a_.share[c]; });
     }
     team.each(plan_.colliders, [&](int c) { a_.share[c] = a_.least[c]; });
-    team.each(plan_.colliders,
-              [&](int c) { a_.hand[c].pose = a_.screw[c].at(a_.share[c]); });
+    team.each(plan_.colliders, [&](int c) { a_.hand[c].pose = a_.screw[c].at(a_.share[c]); });
     team.each(own, [&](int n) {
       const int v = plan_.body_vertices + n, c = plan_.collider[v];
       a_.place[v] = a_.hand[c].pose.place(local_point(plan_, v));

@@ -67,13 +67,20 @@ PD_DEVICE BodyState<T> body_state(const ContactKernel<T>& call, std::int64_t e) 
   const ContactWork<T>& w = call.work;
   const std::int64_t at = 4 * e * w.vertices;
   T *const u = w.u + at, *const before = w.before + at, *const target = w.target + at;
-  return {w.order,    call.memory.component,
-          w.x + at,   u,
-          before,     before,
-          target,     call.memory.saved + at,
-          u + 3,      target + 3,
-          w.material.masses.of(e), 4,
-          w.vertices, w.pieces};
+  return {w.order,
+          call.memory.component,
+          w.x + at,
+          u,
+          before,
+          before,
+          target,
+          call.memory.saved + at,
+          u + 3,
+          target + 3,
+          w.material.masses.of(e),
+          4,
+          w.vertices,
+          w.pieces};
 }
 
 template <class T>
@@ -108,8 +115,8 @@ PD_DEVICE void iterate(const ContactKernel<T>& call, const ContactSteps<T>& step
     team.sum(w.sum_rows, [&](int n, double (&sum)[1]) { sum[0] += rows[n * sums_count]; }, energy);
   }
   double sums[2];
-  const auto merits = steps.iterate(
-      team, k, {T(w.settings.relaxation) * T(omega), guards, soft, energy[0]}, sums);
+  const auto merits =
+      steps.iterate(team, k, {T(w.settings.relaxation) * T(omega), guards, soft, energy[0]}, sums);
   if (!leads) return;
   ++p.used;
   omegas[(k + 1) % guard_period] = p.schedule.next(k + 1);
@@ -160,8 +167,8 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 2 : 1)
         Progress& p = static_cast<Progress*>(w.progress)[e];
         p.used = 0;
         p.done = false;
-        p.stop = {squared_free_fall(w.vertices, w.settings.time_step,
-                                    read3(w.material.gravity.of(e)))};
+        p.stop = {
+            squared_free_fall(w.vertices, w.settings.time_step, read3(w.material.gravity.of(e)))};
       }
     } else if constexpr (What == ContactTask::go_first) {
       steps.go_first(team);
@@ -175,8 +182,7 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 2 : 1)
       const std::int64_t c = e * plan.colliders, m = e * plan.capacity;
       const ContactHistory<T>& to = w.contact.history;
       steps.write(team, {to.next_poses + 7 * c, to.next_keys + m, to.next_forces + 4 * m,
-                         w.contact.held_back + c, forces,
-                         w.contact.info + e * contact_info_count});
+                         w.contact.held_back + c, forces, w.contact.info + e * contact_info_count});
       if (environment.numbers().most_pairs > plan.capacity) take_back(w, team, e);
     }
     team.barrier();

@@ -48,4 +48,25 @@ void run_contact(ContactTask task, const ContactWork<T>& work, int k, Stream str
 template <class T>
 void keep_displacements(const ContactWork<T>& work, Stream stream);
 
+// A step with contact between bodies, of a plan for kernel `stream`.
+template <class Call>
+struct WithContact {
+  Call step;
+  ContactCall<typename Call::real> contact;
+};
+
 }  // namespace pd
+
+namespace pd::inline PD_TARGET {
+
+template <class T>
+std::int64_t contact_stream_bytes(const WithContact<DeviceStep<T>>& call);
+template <class T>
+void run_contact_stream(const WithContact<DeviceStep<T>>& call, void* memory, Stream stream);
+// The same for scenes with stencils.
+template <class T>
+std::int64_t contact_mixed_bytes(const WithContact<MixedStep<T>>& call);
+template <class T>
+void run_contact_mixed(const WithContact<MixedStep<T>>& call, void* memory, Stream stream);
+
+}  // namespace pd::inline PD_TARGET
