@@ -1,4 +1,4 @@
-// Entry points of contact between bodies: the tasks of contact/phases/step.h, a launch each for all environments.
+// Entry points of contact between bodies: the tasks of solver/contact/step.h, a launch each for all environments.
 //
 // Arrays are raw, since every target has types of its own and this part is compiled once. Vertices of the step have four
 // numbers each: x, y, z, and the fourth of cuda/common/vertices.h.

@@ -1,4 +1,4 @@
-// The team of contact/phases on a GPU: some blocks, or one, that work on an environment.
+// The team of solver/contact on a GPU: some blocks, or one, that work on an environment.
 #pragma once
 #include "cuda/common/block_team.h"
 

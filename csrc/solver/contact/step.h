@@ -2,7 +2,7 @@
 //
 //   start; [coarse correction] go_first; for k: [free iterate, energy] iterate(k); [coarse correction] go_last; finish; write
 #pragma once
-#include "contact/phases/approach.h"
+#include "solver/contact/approach.h"
 
 namespace pd::inline PD_TARGET {
 

@@ -1,7 +1,7 @@
 // The search of pairs: static trees of boxes with 32 children a node, made anew from their leaves. A thread takes the parts
 // of a surface that may be first in a pair. Pairs are counted, placed by prefix sums, and lie in the order of their keys.
 #pragma once
-#include "contact/phases/environment.h"
+#include "solver/contact/environment.h"
 
 namespace pd::inline PD_TARGET {
 

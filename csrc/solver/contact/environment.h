@@ -12,8 +12,8 @@
 #pragma once
 #include "contact/box.h"
 #include "contact/pairs/shares.h"
-#include "contact/phases/shared_numbers.h"
 #include "solver/chebyshev.h"
+#include "solver/contact/shared_numbers.h"
 #include "solver/step.h"
 #include "solver/vertex.h"
 

@@ -1,4 +1,4 @@
-// The team of contact/phases on one thread: the CPU's, which takes items in order.
+// The team of solver/contact on one thread: the CPU's, which takes items in order.
 #pragma once
 #include <cstdint>
 

@@ -7,7 +7,7 @@
 // Pairs are not stored: each lowers the shares of its bodies to what it allows. A share is then tried by all pairs again,
 // until none lowers it.
 #pragma once
-#include "contact/phases/search.h"
+#include "solver/contact/search.h"
 
 namespace pd::inline PD_TARGET {
 
