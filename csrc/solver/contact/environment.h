@@ -53,7 +53,7 @@ struct ContactArrays {
   Vec3<T>*begin, *place, *target, *goal, *shift, *checked, *end;  // [vertices] m
   Ball<T>* ball;                                                  // [vertices]
   T *inverse, *weight, *room;                                     // [vertices]
-  unsigned char *held, *cut, *surface;                            // [vertices]
+  unsigned char *held, *cut, *surface, *touched;                  // [vertices]
   // Entries of vertices: corners of their pairs, in the order of the pairs.
   int *start, *cursor;  // [vertices + 1] first entry of each; counts
   int *entry, *slot;    // [4 capacity] pair * 4 + corner in any order; the entry of each corner
@@ -104,7 +104,7 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
     arena.place(*array, v);
   arena.place(a.ball, v);
   for (T** array : {&a.inverse, &a.weight, &a.room}) arena.place(*array, v);
-  for (unsigned char** array : {&a.held, &a.cut, &a.surface}) arena.place(*array, v);
+  for (unsigned char** array : {&a.held, &a.cut, &a.surface, &a.touched}) arena.place(*array, v);
   for (int** array : {&a.start, &a.cursor}) arena.place(*array, v + 1);
   arena.place(a.entry, 4 * m + 1);
   arena.place(a.slot, 4 * m);
@@ -198,7 +198,7 @@ struct ContactEnvironment {
       });
     }
   }
-  // The force of a pair, by entries; without weights where it does not count.
+  // The force of a pair, by entries; zeros where it does not count.
   PD_HD void keep_pushes(int p, bool counts) const {
     const ContactPair<T>& pair = a.pair[p];
     const Vec3<T> force = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);

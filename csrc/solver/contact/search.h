@@ -286,7 +286,11 @@ class ContactSearch {
       for (int n = begin; n < a.start[v + 1]; ++n) rank += a.entry[n] < e;
       a.slot[e] = begin + rank;
     });
-    team.each(count, [&](int p) { env_.keep_spaces(p); });
+    team.each(count, [&](int p) {
+      a.active[p] = 0;
+      env_.keep_spaces(p);
+      env_.keep_pushes(p, false);
+    });
   }
 
   const Env& env_;

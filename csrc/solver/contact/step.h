@@ -256,6 +256,7 @@ class ContactSteps {
   template <class Team>
   PD_HD void want(const Team& team, const T* displacement) const {
     team.spread(1, [&](int) { env_.numbers().cut = 0; });
+    team.spread(plan_.vertices, [&](int v) { a_.touched[v] = 0; });
     team.spread(body_.vertices, [&](int i) { want_vertex(i, displacement); });
     team.each(plan_.vertices - plan_.body_vertices, [&](int n) {
       a_.target[plan_.body_vertices + n] = a_.goal[plan_.body_vertices + n];
@@ -322,9 +323,11 @@ class ContactSteps {
       } else {
         pair.force = {};  // nothing can yield
       }
+      if (active || a_.active[p]) env_.keep_pushes(p, active);
       a_.active[p] = active;
-      if (active) numbers.active = 1;
-      env_.keep_pushes(p, active);
+      if (!active) return;
+      numbers.active = 1;
+      for (int v : pair.vertex) a_.touched[v] = 1;
     });
     if (!numbers.active) return;
     push(team, c, true, false);
@@ -353,8 +356,8 @@ class ContactSteps {
   template <class Team>
   PD_HD void push(const Team& team, T c, bool first, bool last) const {
     team.each(plan_.vertices, [&](int v) {
+      if (!a_.touched[v]) return;
       const int begin = a_.start[v], end = a_.start[v + 1];
-      if (begin == end) return;
       Vec3<T> shift = a_.target[v];
       const T inverse = a_.inverse[v];
       T weight(0);

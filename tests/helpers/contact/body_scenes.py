@@ -185,7 +185,7 @@ def plates(to: float, seconds: float = 0.2) -> tuple[Course, pd.Collider, pd.Col
 
 
 def two_sheets(cells: int) -> Course:
-    """A level cloth of .4 m falls on another one, which is pinned, from a tenth of a millimetre above where it rests."""
+    """A level cloth of .4 m falls on another one, which is pinned, by a tenth of a millimetre."""
     lower, upper = (cloth(plane(0.4, 0.4, cells).translated((0.0, height, 0.0))) for height in (0.0, 0.0011))
     pin = pd.Pin(lower, np.ones(len(lower.mesh.vertices), dtype=bool))
     scene = pd.Scene(lower, upper, pin, gravity(), pd.Contact(thickness=THICKNESS))
