@@ -1,7 +1,7 @@
 // The op of a step with contact between bodies.
 #pragma once
 #include "binding/ops.h"
-#include "cpu/contact/views.h"
+#include "contact/views.h"
 
 #include <cstdint>
 #include <tuple>
@@ -39,11 +39,11 @@ enum ContactArray : int {
 enum ContactSize : int { size_bodies, size_colliders, size_capacity, contact_size_count };
 
 template <class T>
-ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertices) {
+ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertices,
+                                 const Place& place) {
   TORCH_CHECK_VALUE(arrays.size() == contact_array_count, "contact must have ",
                     int(contact_array_count), " arrays, got ", arrays.size(),
                     "; compile the scene again");
-  const Place place{at::kCPU};
   const int32* sizes = sizes_view(arrays[contact_sizes], contact_size_count);
   ContactPlan<T> plan;
   plan.bodies = sizes[size_bodies];
@@ -95,16 +95,20 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
                     " bodies, got ", describe(arrays[contact_friction]),
                     "; compile the scene again");
   plan.friction = arrays[contact_friction].const_data_ptr<T>();
-  plan.thickness = *reals(contact_thickness, 1, 1, "thickness [m]");
+  // a number of the host, as sizes
+  check_array(arrays[contact_thickness], scalar_type<T>, 1, 1, {at::kCPU, "every plan's thickness"},
+              "contact", "thickness [m]");
+  plan.thickness = *arrays[contact_thickness].const_data_ptr<T>();
   return plan;
 }
 
 template <class Backend, class T>
 ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at::TensorList history,
                                   at::TensorList contact, const Settings& settings, bool report) {
-  StepCall<T> call;
+  typename Backend::template Step<T> call;
   const Place place{t.positions.device()};
   call.plan = Backend::template plan_view<T>(t.plan, place);
+  Backend::view_stencils(call, t.plan, place);
   call.batch = t.positions.size(0);
   check_vertices(t.positions, call.plan.vertices);
   TORCH_CHECK_VALUE(!settings.multilevel(),
@@ -125,7 +129,7 @@ ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at:
   call.info = t.info.mutable_data_ptr<double>();
 
   ContactCall<T> of;
-  of.plan = contact_plan_view<T>(contact, call.plan.vertices);
+  of.plan = contact_plan_view<T>(contact, call.plan.vertices, place);
   const std::int64_t b = call.batch, c = of.plan.colliders, m = of.plan.capacity;
   const at::ScalarType real = scalar_type<T>;
   const auto check = [&](const Tensor& tensor, at::ScalarType type, at::IntArrayRef shape,
@@ -157,7 +161,7 @@ ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at:
   of.held_back = held.mutable_data_ptr<T>();
   of.forces = pushes.mutable_data_ptr<T>();
   of.report = report;
-  if (b > 0) Backend::contact_step(call, of);
+  if (b > 0) Backend::contact_step(call, of, t.positions);
   return {t.out_positions, t.out_velocities, t.info,      info,  held,
           next_poses,      next_keys,        next_forces, pushes};
 }
@@ -179,7 +183,7 @@ ContactOutputs contact_step(const Numbers& n, const Tensor& positions, const Ten
           ? contact_step_typed<Backend, float>(tensors, poses, history, contact, settings, n.report)
           : contact_step_typed<Backend, double>(tensors, poses, history, contact, settings,
                                                 n.report);
-  if (n.report) report_step<Backend>(tensors, n);
+  if (n.report) Backend::report_contact(tensors, n, std::get<3>(made), std::get<8>(made));
   return made;
 }
 

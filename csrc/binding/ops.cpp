@@ -46,11 +46,18 @@ struct Cpu {
   static void step(const StepCall<double>& call, const Tensor&) {
     kernels().step64(call, threads());
   }
-  static void contact_step(const StepCall<float>& call, const ContactCall<float>& contact) {
+  static void contact_step(const StepCall<float>& call, const ContactCall<float>& contact,
+                           const Tensor&) {
     kernels().contact_step32(call, contact, threads());
   }
-  static void contact_step(const StepCall<double>& call, const ContactCall<double>& contact) {
+  static void contact_step(const StepCall<double>& call, const ContactCall<double>& contact,
+                           const Tensor&) {
     kernels().contact_step64(call, contact, threads());
+  }
+  // the step itself finds its residual
+  static void report_contact(const StepTensors& taken, const Numbers& n, const Tensor&,
+                             const Tensor&) {
+    report_step<Cpu>(taken, n);
   }
   static void field(const FieldCall<float>& call, const Tensor&) {
     kernels().field32(call, threads());

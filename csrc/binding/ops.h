@@ -83,7 +83,7 @@ inline Tensor info_for(const Tensor& positions, at::IntArrayRef records) {
 
 // Fills in the fields that a step of one record leaves blank, see binding/step_report.h.
 template <class Backend>
-void report_step(const StepTensors& taken, const Numbers& n);
+void report_step(const StepTensors& taken, const Numbers& n, const Tensor* contact = nullptr);
 
 // A rollout with reports, step by step where they are recorded, see binding/step_report.h.
 template <class Backend>

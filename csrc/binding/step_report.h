@@ -5,8 +5,9 @@
 
 namespace pd {
 
+// `contact`: forces of contact on every vertex, those of bodies first [batch, rows, 3], or null.
 template <class Backend, class T>
-void report_typed(const StepTensors& t, const Numbers& n) {
+void report_typed(const StepTensors& t, const Numbers& n, const Tensor* contact) {
   ReportCall<T, typename Backend::template Plan<T>> call;
   const Place place{t.positions.device()};
   call.plan = Backend::template plan_view<T>(t.plan, place);
@@ -31,6 +32,10 @@ void report_typed(const StepTensors& t, const Numbers& n) {
   call.positions = x.const_data_ptr<T>();
   call.velocities = v.const_data_ptr<T>();
   call.forces = f.defined() ? f.const_data_ptr<T>() : nullptr;
+  if (contact) {
+    call.contact = contact->const_data_ptr<T>();
+    call.contact_rows = contact->size(1);
+  }
   call.displacement = u.const_data_ptr<T>();
   call.elastic_gradient = gradient.const_data_ptr<T>();
   call.elements = elements.const_data_ptr<T>();
@@ -40,11 +45,11 @@ void report_typed(const StepTensors& t, const Numbers& n) {
 }
 
 template <class Backend>
-void report_step(const StepTensors& taken, const Numbers& n) {
+void report_step(const StepTensors& taken, const Numbers& n, const Tensor* contact) {
   if (taken.positions.scalar_type() == at::kFloat) {
-    report_typed<Backend, float>(taken, n);
+    report_typed<Backend, float>(taken, n, contact);
   } else {
-    report_typed<Backend, double>(taken, n);
+    report_typed<Backend, double>(taken, n, contact);
   }
 }
 

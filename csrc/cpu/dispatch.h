@@ -1,6 +1,6 @@
 // Which compiled instruction set this machine runs.
 #pragma once
-#include "cpu/contact/views.h"
+#include "contact/views.h"
 #include "views/views.h"
 
 #include <string>

@@ -99,6 +99,13 @@ struct ReportVertex {
     return (x * x + y * y) + z * z;
   }
 
+  // of pairs between bodies
+  PD_HD Vec3<T> contact_force() const {
+    if (!call.contact) return {T(0), T(0), T(0)};
+    const T* p = call.contact + 3 * (environment * call.contact_rows + vertex);
+    return {p[0], p[1], p[2]};
+  }
+
   // Adds the vertex's terms to every ReportSum.
   PD_HD void add_to(double (&sum)[report_sums]) const {
     const T stiffness = spring(), elastic = call.elastic.of(environment)[vertex];
@@ -112,10 +119,11 @@ struct ReportVertex {
     sum[report_invalid] += inertia_ratio(a, elastic, at.inverse) < T(0) ? 1 : 0;
     if (!(at.inverse > T(0))) return;
     const MaterialContacts<T> contacts{call.material, environment};
-    const Vec3<T> slope = at.gradient(u, force), free = subtract_product(u, at.inverse, slope);
+    const Vec3<T> left = force - contact_force();
+    const Vec3<T> slope = at.gradient(u, left), free = subtract_product(u, at.inverse, slope);
     const Vec3<T> pushed = contacts.project(x, free, u) - free;
     const bool touches = !(dot(pushed, pushed) == T(0));
-    sum[report_residual] += square(touches ? at.residual(contacts, u, force) : slope);
+    sum[report_residual] += square(touches ? at.residual(contacts, u, left) : slope);
     sum[report_force] += square(a * (u - at.target)) + square(force);
     double rounding = double(elements.y) + double(a) * sqrt(square(u));
     if (touches) rounding += contacts.size(x + u) / double(at.inverse);

@@ -412,8 +412,10 @@ struct ReportCall {
   const T* displacement = nullptr;  // u
   const T* elastic_gradient = nullptr;
   const T* elements = nullptr;  // Field::report
-  double* sums = nullptr;       // [batch, chunks, report_sums]
-  double* info = nullptr;       // [batch, info_count] of the step; the report fills in its blanks
+  const T* contact = nullptr;   // forces between bodies [batch, contact_rows, 3], or null
+  std::int64_t contact_rows = 0;
+  double* sums = nullptr;  // [batch, chunks, report_sums]
+  double* info = nullptr;  // [batch, info_count] of the step; the report fills in its blanks
 
   PD_HD int chunks() const { return (plan.vertices + report_chunk - 1) / report_chunk; }
 };

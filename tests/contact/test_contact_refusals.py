@@ -30,10 +30,10 @@ SIMULATORS: dict[str, Callable[[], object]] = {
     "adjoint must be \"solver\" in a scene with Contact.* got 'multilevel'": lambda: setattr(
         SIM, "adjoint", "multilevel"
     ),
-    "device must be the CPU in a scene with Contact, got meta; .*leave device out": lambda: pd.Simulator(
+    "device must be a CPU or a GPU in a scene with Contact, got meta; .*leave device out": lambda: pd.Simulator(
         COURSE.scene, device="meta"
     ),
-    "device must be the CPU in a scene with Contact, got meta": lambda: SIM.to("meta"),
+    "device must be a CPU or a GPU in a scene with Contact, got meta": lambda: SIM.to("meta"),
 }
 
 
@@ -71,7 +71,7 @@ STEPS: dict[str, Callable[[], object]] = {
     "must not be transformed by torch.func or vmap": lambda: torch.func.vmap(
         lambda target: SIM(STATE, targets={LEFT: target}).positions
     )(pose()[None]),
-    "capture: the scene must have no Contact": lambda: SIM.capture(STATE),
+    "capture: the simulator must be on a GPU for a CUDA graph, got cpu": lambda: SIM.capture(STATE),
     "contact_forces: the scene must have no Contact.*history.forces": lambda: SIM.contact_forces(STATE, STATE),
     "state must be a HistoryState, in a scene with Contact, .* got State": lambda: SIM(pd.State(*STATE[:2])),
     "targets of a Collider must be finite poses .* quaternion is not zero": lambda: SIM(

@@ -16,7 +16,7 @@ from .diagonal import CORE_COUNT, STIFFNESS_PLACE, elastic_rows, named_material
 __all__ = ["INFO_WIDTH"]
 
 INFO_WIDTH = _C.info_numbers
-CONTACT_INFO_WIDTH = 8  # contact_info_count of csrc/cpu/contact/views.h
+CONTACT_INFO_WIDTH = 8  # contact_info_count of csrc/contact/views.h
 CONTACT_BODY = 4  # place of the body of each vertex among the arrays of contact, csrc/binding/contact_ops.h
 
 

@@ -21,7 +21,7 @@ A group of tetrahedra that averages its volume strain lies in one patch. The pat
 solids with Poisson's ratio run as "block", "grid" or "stream".
 
 Scenes with stencils (cloth, rods, springs, ties, fibres, limits, damping) run as "block" where the mesh fits the shared
-memory of a block, else as "stream".
+memory of a block, else as "stream". Scenes with `Contact` run as "stream".
 
 The batch of a state has no influence: an environment gives the same bits alone and in any batch.
 """
@@ -390,6 +390,13 @@ def choose_plan(
     """
     check_kernel(kernel)
     _check_stencils(values, kernel, levels)
+    if values.contact is not None:
+        if kernel not in ("auto", "benchmark", "stream"):
+            raise ValueError(
+                f'Simulator: kernel must be "stream" in a scene with Contact on a GPU, got {kernel!r}; leave it at '
+                '"auto"'
+            )
+        kernel = "stream"
     scene = _PlanBuilder(values, dtype, progress)
     size = "any" if batch is None else "many" if _MANY_SHARE * batch >= gpu.multiprocessors else "few"
     if levels:

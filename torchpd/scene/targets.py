@@ -139,8 +139,9 @@ class Anchors:
         for part, value in moved.items():
             value = self._checked("targets of a Collider", value, len(poses), [(7,)], poses)
             length = value[..., 3:].norm(dim=-1, keepdim=True)
-            # reading values is cheap on the CPU, where alone colliders are; a traced step has none
-            if not torch.compiler.is_compiling() and not bool(((length > 0.0) & value.isfinite()).all()):
+            # a GPU would have to wait for the values, and a traced step has none
+            read = value.device.type == "cpu" and not torch.compiler.is_compiling()
+            if read and not bool(((length > 0.0) & value.isfinite()).all()):
                 raise ValueError(
                     "targets of a Collider must be finite poses (x, y, z, qw, qx, qy, qz) whose quaternion is not "
                     f"zero, got {value.tolist()}; (1, 0, 0, 0) turns nothing"

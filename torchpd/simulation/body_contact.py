@@ -18,13 +18,13 @@ from .state import ContactHistory, HistoryState, State
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_GAP, _MISSING, _PINS_HELD_BACK, _UNBALANCED = 0, 1, 6, 7  # columns in csrc/cpu/contact/views.h
+_GAP, _MISSING, _PINS_HELD_BACK, _UNBALANCED = 0, 1, 6, 7  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 
 
 @dataclass(frozen=True, eq=False)
 class BodyContact:
-    """The contact of a scene compiled for a precision."""
+    """The contact of a scene compiled for a precision and a device."""
 
     plan: ContactPlan
     arrays: list[Tensor]  # of the op, csrc/binding/contact_ops.h
@@ -32,23 +32,23 @@ class BodyContact:
 
     @staticmethod
     def of(values: SceneValues, dtype: torch.dtype) -> BodyContact:
-        """Compile the contact of a scene; refuse rest positions that cross or touch."""
+        """Compile the contact of a scene on the CPU; refuse rest positions that cross or touch."""
         plan = contact_plan(values)
-        made = BodyContact._in_precision(plan, dtype)
+        made = BodyContact._made(plan, dtype, torch.device("cpu"))
         check_start(plan, plan.rest, torch.finfo(dtype).eps, "Simulator: rest positions")
         return made
 
-    def to(self, dtype: torch.dtype) -> BodyContact:
-        """The same in another precision, whose rounding must be below the thickness."""
-        return BodyContact._in_precision(self.plan, dtype)
+    def to(self, dtype: torch.dtype, device: torch.device) -> BodyContact:
+        """The same elsewhere, or in another precision, whose rounding must be below the thickness."""
+        return BodyContact._made(self.plan, dtype, device)
 
     @staticmethod
-    def _in_precision(plan: ContactPlan, dtype: torch.dtype) -> BodyContact:
+    def _made(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> BodyContact:
         plan.check_resolution(dtype)
-        poses = torch.tensor(plan.poses, dtype=dtype).reshape(-1, 7)
-        keys = torch.tensor(-1).expand(plan.capacity)
-        forces = torch.zeros((), dtype=dtype).expand(plan.capacity, 4)
-        return BodyContact(plan, _arrays(plan, dtype), (poses, keys, forces))
+        poses = torch.tensor(plan.poses, dtype=dtype, device=device).reshape(-1, 7)
+        keys = torch.tensor(-1, device=device).expand(plan.capacity)
+        forces = torch.zeros((), dtype=dtype, device=device).expand(plan.capacity, 4)
+        return BodyContact(plan, _arrays(plan, dtype, device), (poses, keys, forces))
 
     def step(
         self,
@@ -125,8 +125,8 @@ class BodyContact:
             )
 
 
-def _arrays(plan: ContactPlan, dtype: torch.dtype) -> list[Tensor]:
-    """Arrays of the op in their order."""
+def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list[Tensor]:
+    """Arrays of the op in their order. The first and the last, sizes and thickness, stay on the host."""
 
     def whole(array: Any) -> Tensor:
         return torch.tensor(np.asarray(array), dtype=torch.int32)
@@ -134,12 +134,13 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype) -> list[Tensor]:
     def real(array: Any) -> Tensor:
         return torch.tensor(np.asarray(array), dtype=dtype)
 
-    sizes = [len(plan.self_contact), len(plan.poses), plan.capacity]
+    sizes = whole([len(plan.self_contact), len(plan.poses), plan.capacity])
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     trees = [plan.vertex_tree.order, plan.triangle_tree.order, plan.edge_tree.order]
-    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction, [plan.thickness]]
+    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
-    return [*map(whole, [sizes, *surfaces, *trees]), keys, *map(real, reals)]
+    moved = [array.to(device) for array in (*map(whole, [*surfaces, *trees]), keys, *map(real, reals))]
+    return [sizes, *moved, real([plan.thickness])]
 
 
 def _refuse_gradients(

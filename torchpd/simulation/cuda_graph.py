@@ -8,15 +8,21 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from ..ops.registration import INFO_WIDTH
 from ..plan.material import named_arrays
 from ..scene.targets import Targets
-from .state import Info, State
+from .state import HistoryState, Info, State, history_of
 
 if TYPE_CHECKING:
     from .stepper import Stepper
 
 __all__ = ["CapturedStep"]
+
+
+def _copied(state: State | HistoryState) -> State | HistoryState:
+    positions, velocities = state[0].clone(), state[1].clone()
+    if len(state) == 2:
+        return State(positions, velocities)
+    return HistoryState(positions, velocities, history_of(array.clone() for array in state[2]))
 
 
 class CapturedStep:
@@ -39,17 +45,13 @@ class CapturedStep:
     def __init__(
         self,
         sim: Stepper,
-        state: State,
+        state: State | HistoryState,
         forces: Tensor | None,
         targets: Targets | None,
         start: str | Tensor,
         *,
         report: bool,
     ) -> None:
-        if sim.body_contact is not None:
-            raise RuntimeError(
-                "capture: the scene must have no Contact, whose steps run on the CPU alone; call step_ or rollout"
-            )
         if sim.device.type != "cuda":
             raise RuntimeError(
                 f"capture: the simulator must be on a GPU for a CUDA graph, got {sim.device}: move it with "
@@ -57,13 +59,13 @@ class CapturedStep:
             )
         self.state = state
         self._sim = sim
-        rows = (len(state[0]), INFO_WIDTH)
+        rows = (len(state[0]), sim.info_width)
         self._rows = torch.empty(rows, dtype=torch.float64, device=sim.device) if report else None
         # the graph holds addresses only, so the tensors must live as long as the graph
         own = dict(targets) if isinstance(targets, Mapping) else targets
         self._alive = ([array.detach() for array in named_arrays(sim).values()], sim.loads, forces, own, start)
 
-        def run(moved: State) -> None:
+        def run(moved: State | HistoryState) -> None:
             sim.step_(moved, forces, targets, start, info=self._rows)
 
         # a first call allocates and loads, which cannot be recorded: run it on a copy of the state
@@ -71,7 +73,7 @@ class CapturedStep:
             stream = torch.cuda.Stream()
             stream.wait_stream(torch.cuda.current_stream())
             with torch.cuda.stream(stream):
-                run(State(state[0].clone(), state[1].clone()))
+                run(_copied(state))
             self._plan = sim.plan  # a first step may have replaced it
             torch.cuda.current_stream().wait_stream(stream)
             self._graph = torch.cuda.CUDAGraph()

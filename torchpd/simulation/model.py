@@ -489,7 +489,7 @@ class Model(nn.Module):
             raise TypeError(f"Simulator: dtype must be torch.float32 or torch.float64, got {wanted.dtype}")
         check_time_step(self.time_step, wanted.dtype)
         check_contact(self.scene, device=wanted.device)
-        contact = None if self.body_contact is None else self.body_contact.to(wanted.dtype)
+        contact = None if self.body_contact is None else self.body_contact.to(wanted.dtype, wanted.device)
         choice, ends = self.choice, {self.device.type, wanted.device.type}
         # widening does not restore the digits that float32 lost, and "meta" has none
         loses_positions = wanted.dtype != self.dtype or self.device.type == "meta"

@@ -72,10 +72,10 @@ def check_contact(
             f'Simulator: adjoint must be "solver" in a scene with Contact, whose steps have no gradient, got '
             f"{adjoint!r}; leave it out"
         )
-    if device is not None and device.type != "cpu":
+    if device is not None and device.type not in ("cpu", "cuda"):
         raise RuntimeError(
-            f"Simulator: device must be the CPU in a scene with Contact, got {device}; contact between bodies has no "
-            "kernels there: leave device out, or remove Contact"
+            f"Simulator: device must be a CPU or a GPU in a scene with Contact, got {device}; contact between bodies "
+            "has no kernels there: leave device out, or remove Contact"
         )
 
 

@@ -157,7 +157,7 @@ class Stepper(Readable):
             )
         if not (info is None or isinstance(info, Tensor)):
             raise TypeError(
-                f"step_: info must be None or a float64 tensor {[len(state[0]), self._info_width]} to fill in, got "
+                f"step_: info must be None or a float64 tensor {[len(state[0]), self.info_width]} to fill in, got "
                 f"{type(info).__name__}"
             )
         given, inertial = _first_iterate(start, state[0])
@@ -186,7 +186,7 @@ class Stepper(Readable):
             self._notices.after(self, state[0], info)
 
     @property
-    def _info_width(self) -> int:
+    def info_width(self) -> int:
         """Columns of the rows of a report."""
         return INFO_WIDTH if self.body_contact is None else INFO_WIDTH + _OF_CONTACT
 
@@ -202,7 +202,7 @@ class Stepper(Readable):
     ) -> None:
         """`step_` in a scene with `Contact`."""
         if info is not None:
-            check_info(info, (len(state[0]), self._info_width))
+            check_info(info, (len(state[0]), self.info_width))
         after, rows = self._stepped(state, forces, given, material, poses, inertial=inertial, report=info is not None)
         old = (state[0], state[1], *state[2])  # type: ignore[misc]
         for kept, new in zip(old, (after[0], after[1], *after[2]), strict=True):

@@ -1,6 +1,7 @@
 // The ops on CUDA. Torch provides memory, stream and device.
 #include "binding/rollout_adjoint.h"
 
+#include "binding/contact_ops.h"
 #include "binding/plan_views.h"
 #include "cuda/common/launch.h"
 #include "cuda/poisson/launch.h"
@@ -92,6 +93,34 @@ struct Cuda {
           ? run(like, call, mixed_step_bytes<T>, stream ? run_mixed_stream<T> : run_mixed_block<T>)
           : run<DeviceStep<T>>(like, call, step_bytes<T>, stream ? run_stream<T> : run_fused<T>);
     }
+  }
+
+  template <class T>
+  static void contact_step(const Step<T>& call, const ContactCall<T>& contact, const Tensor& like) {
+    TORCH_CHECK_VALUE(call.plan.kernel == int(DeviceKernel::stream),
+                      "plan must be one for kernel 3 (stream) in a scene with Contact, got kernel ",
+                      call.plan.kernel, "; compile the scene again");
+    check_rows<T>(call);
+    using Solids = WithContact<DeviceStep<T>>;
+    using All = WithContact<Step<T>>;
+    if (runs_with_poisson(call)) {
+      const Step<T> own = with_poisson(call);
+      is_mixed(own) ? run<All>(like, {own, contact}, poisson::contact_mixed_bytes<T>,
+                               poisson::run_contact_mixed<T>)
+                    : run<Solids>(like, {own, contact}, poisson::contact_stream_bytes<T>,
+                                  poisson::run_contact_stream<T>);
+    } else {
+      is_mixed(call)
+          ? run<All>(like, {call, contact}, contact_mixed_bytes<T>, run_contact_mixed<T>)
+          : run<Solids>(like, {call, contact}, contact_stream_bytes<T>, run_contact_stream<T>);
+    }
+  }
+
+  // The residual of the report, without what forces between bodies [batch, vertices, 3] balance.
+  static void report_contact(const StepTensors& taken, const Numbers& n, const Tensor& numbers,
+                             const Tensor& forces) {
+    report_step<Cuda>(taken, n, &forces);
+    numbers.select(1, contact_residual).copy_(taken.info.select(1, info_residual));
   }
 
   template <class T>
@@ -188,6 +217,7 @@ struct Cuda {
 TORCH_LIBRARY_IMPL(torchpd, CUDA, m) {
   register_ops<Cuda>(m);
   register_adjoint_ops<Cuda>(m);
+  register_contact_ops<Cuda>(m);
 }
 
 }  // namespace pd

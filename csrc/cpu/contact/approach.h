@@ -6,19 +6,8 @@
 // share, so that what moves alike does not hinder itself. Then each goes on alone, by the share that planes allow.
 #pragma once
 #include "cpu/contact/run.h"
-#include "math/svd.h"
 
 namespace pd::inline PD_TARGET {
-
-constexpr double no_inertia = 1e-12;  // of the largest moment of a body: a line turns about itself
-
-// The rigid part of the ways of a body, by its momenta.
-struct RigidWay {
-  double mass = 0;
-  Vec3<double> center = {0, 0, 0}, mean = {0, 0, 0}, turn = {0, 0, 0};
-
-  Vec3<double> at(const Vec3<double>& place) const { return mean + cross(turn, place - center); }
-};
 
 template <class T>
 class Approach {
@@ -103,30 +92,11 @@ class Approach {
       const int b = plan_.body[v];
       const double m = mass(v);
       const Vec3<double> arm = wide(place[v]) - rigid_[b].center;
-      momentum[b] = multiply_add(m, cross(arm, wide(target[v]) - wide(place[v])), momentum[b]);
-      const double square = dot(arm, arm), at[3] = {arm.x, arm.y, arm.z};
-      for (int r = 0; r < 3; ++r) {
-        Vec3<double> row = {-at[r] * arm.x, -at[r] * arm.y, -at[r] * arm.z};
-        (r == 0 ? row.x : r == 1 ? row.y : row.z) += square;
-        moment[b].row[r] = multiply_add(m, row, moment[b].row[r]);
-      }
+      add_moment(m, arm, wide(target[v]) - wide(place[v]), moment[b], momentum[b]);
     }
     for (int b = 0; b < plan_.bodies; ++b) {
       if (rigid_[b].mass > 0) rigid_[b].turn = turn_of(moment[b], momentum[b]);
     }
-  }
-
-  // moment^-1 momentum, 0 about axes without inertia
-  static Vec3<double> turn_of(const Mat3<double>& moment, const Vec3<double>& momentum) {
-    const SignedSvd<double> svd = signed_svd(moment);
-    const Mat3<double> axes = transpose(svd.u);
-    Vec3<double> turn = {0, 0, 0};
-    for (int n = 0; n < 3; ++n) {
-      const double inertia = absolute(svd.s[n]);
-      if (inertia > no_inertia * absolute(svd.s[0]))
-        turn = multiply_add(dot(axes.row[n], momentum) / inertia, axes.row[n], turn);
-    }
-    return turn;
   }
 
   // Bodies whose parts stay apart along their ways. A rigid motion shortens no distance, so only pairs within reach of the
@@ -139,59 +109,18 @@ class Approach {
       reach[v] = square_root(dot(rest, rest));
     }
     for (int b = 0; b < plan_.bodies; ++b) own_[b] = rigid_[b].mass > 0;
-    run.search().each_boxed([&](int v) { return Box<T>{place[v], place[v]}; },
-                            [&](int v) { return reach[v] + T(0.5) * plan_.thickness; },
-                            [&](int v) { return run.moves_by_hand(v); },
-                            [&](const ContactPair<T>& pair) {
-                              const int b = plan_.body[pair.vertex[0]];
-                              if (b != plan_.body[pair.vertex[3]] || !own_[b]) return;
-                              Vec3<T> start[4], end[4];
-                              pair.corners(place, start);
-                              pair.corners(target, end);
-                              const Closest<T> near = closest_points(pair.edges, start);
-                              T side[2] = {T(0), T(0)};
-                              for (int a = 0; a < 4; ++a) {
-                                T& most = side[pair.on_a(a) ? 0 : 1];
-                                most = std::max(most, reach[pair.vertex[a]]);
-                              }
-                              if (!(near.distance <= side[0] + side[1] + plan_.thickness)) return;
-                              const Kept kept = direction_of(pair, start, end);
-                              const T gap = gap_along(pair.edges, kept.normal, end);
-                              own_[b] = !(gap < kept.least) && kept.least > gap_bound(end);
-                            });
-  }
-
-  // A direction with the largest gap at both ends, and the gap that must be kept along it: the floor, or the gap at the start
-  // where that is less. If no direction has it at both ends, the one with the largest gap at the start is taken.
-  struct Kept {
-    Vec3<T> normal;
-    T least;
-  };
-  static Kept direction_of(const ContactPair<T>& pair, const Vec3<T> (&start)[4],
-                           const Vec3<T> (&end)[4]) {
-    const bool edges = pair.edges;
-    const Closest<T> first = closest_points(edges, start), last = closest_points(edges, end);
-    Vec3<T> by_a{T(0), T(0), T(0)}, by_b = by_a, own = by_a, both = by_a;
-    for (int a = 0; a < 4; ++a) {
-      Vec3<T>& side = pair.on_a(a) ? by_a : by_b;
-      side = side + (end[a] - start[a]);
-    }
-    const T on_a(edges ? 2 : 1), on_b(edges ? 2 : 3);
-    const Vec3<T> relative = (T(1) / on_a) * by_a - (T(1) / on_b) * by_b;
-    const T square = dot(relative, relative);
-    const T share = dot(first.diff, relative) / (square > T(0) ? square : T(1));
-    T largest = T(-HUGE_VAL), lower = T(-HUGE_VAL);
-    const auto consider = [&](const Vec3<T>& normal) {
-      const T before = gap_along(edges, normal, start), after = gap_along(edges, normal, end);
-      const T smaller = before < after ? before : after;
-      if (before > largest) largest = before, own = normal;
-      if (smaller > lower) lower = smaller, both = normal;
-    };
-    each_candidate(edges, start, first, consider);
-    visit_unit(subtract_product(first.diff, share, relative), consider);
-    each_candidate(edges, end, last, consider);
-    const T least = largest < pair.floor() ? largest : pair.floor();
-    return {lower >= least ? both : own, least};
+    run.search().each_boxed(
+        [&](int v) { return Box<T>{place[v], place[v]}; },
+        [&](int v) { return reach[v] + T(0.5) * plan_.thickness; },
+        [&](int v) { return run.moves_by_hand(v); },
+        [&](const ContactPair<T>& pair) {
+          const int b = plan_.body[pair.vertex[0]];
+          if (b != plan_.body[pair.vertex[3]] || !own_[b]) return;
+          Vec3<T> start[4], end[4];
+          pair.corners(place, start);
+          pair.corners(target, end);
+          own_[b] = stays_apart(pair, start, end, [&](int v) { return reach[v]; }, plan_.thickness);
+        });
   }
 
   // Places after a share of the ways.
@@ -289,8 +218,7 @@ class Approach {
         continue;
       Vec3<T> corner[4];
       for (int a = 0; a < 4; ++a) corner[a] = place(pair.vertex[a]);
-      const T gap = gap_along(pair.edges, kept_[n].normal, corner);
-      if (gap < kept_[n].least || gap <= gap_bound(corner)) return false;
+      if (!kept_[n].allows(pair.edges, corner)) return false;
     }
     const Ball<T> anywhere{{T(0), T(0), T(0)}, T(HUGE_VAL)};
     for (int v = 0; v < plan_.body_vertices; ++v) {
@@ -346,7 +274,7 @@ class Approach {
 
   const ContactPlan<T>& plan_;
   PairList<T> list_;
-  std::vector<Kept> kept_;        // of the pairs of a group
+  std::vector<Kept<T>> kept_;     // of the pairs of a group
   std::vector<Screw<T>> screws_;  // of colliders
   std::vector<T> together_, alone_;
   std::vector<int> group_;

@@ -3,18 +3,12 @@
 // A search lists all pairs that may come near. No vertex leaves its ball, nor the half-spaces of its pairs: see
 // contact/pairs/half_space.h. Planes that the next iterate violates are made anew at the present one before.
 #pragma once
-#include "cpu/contact/hands.h"
+#include "contact/pairs/shares.h"
+#include "cpu/contact/pairs.h"
 
 #include <cmath>
 
 namespace pd::inline PD_TARGET {
-
-constexpr int contact_sweeps = 4;     // of multipliers in an iteration
-constexpr int search_pause = 5;       // least iterations between searches
-constexpr double ball_reach = 1.2;    // of what a vertex wants; see ball_cells
-constexpr double ball_room = 0.49;    // of the room to the nearest other side
-constexpr double ball_cells = 0.25;   // most radius of a ball, over the mean edge
-constexpr double least_yield = 1e-6;  // of the weights of a pair, on vertices that move freely
 
 template <class T>
 class ContactRun {
@@ -182,11 +176,7 @@ class ContactRun {
       push(c);
       for (int p : active_) {
         ContactPair<T>& pair = list_.pairs[p];
-        T sum(0);
-        for (int a = 0; a < 4; ++a) {
-          const int v = pair.vertex[a];
-          sum = multiply_add(absolute(pair.near.weight[a]) * weights_[v], inverse_[v], sum);
-        }
+        const T sum = row_bound(pair, weights_, inverse_);
         Vec3<T> between[4], before[4];
         pair.corners(shift_, between);
         pair.corners(begin_, before);
@@ -255,7 +245,7 @@ class ContactRun {
   // calls visit(vertex) for vertices of pairs between bodies with a force that is known, one of each side
   template <class Visit>
   void each_known(const Visit& visit) const {
-    const std::int64_t first_edge = std::int64_t(plan_.vertices) * plan_.triangles;
+    const std::int64_t first_edge = first_edge_key(plan_);
     for (const Known& known : known_) {
       const bool edges = known.key >= first_edge;
       const std::int64_t key = edges ? known.key - first_edge : known.key,
@@ -317,12 +307,7 @@ class ContactRun {
   // Planes that targets violate are made anew at the present iterate.
   void refresh() {
     for (ContactPair<T>& pair : list_.pairs) {
-      bool broken = pair.plane.frozen;
-      for (int a = 0; a < 4; ++a) {
-        const T height = dot(pair.plane.normal, target_[pair.vertex[a]]);
-        broken = broken || (pair.on_a(a) ? height < pair.plane.above : height > pair.plane.below);
-      }
-      if (broken) make_plane(pair, place_, target_, pair.near, pair.plane.normal);
+      if (breaks(pair, target_)) make_plane(pair, place_, target_, pair.near, pair.plane.normal);
     }
   }
 

@@ -140,17 +140,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   auto walls() const {
     return [this](int v, const Vec3<T>& place, const auto& visit) {
       if (!HasContacts || v >= run_.plan().body_vertices || run_.moves_by_hand(v)) return;
-      const auto no_deeper = [&](const Vec3<T>& normal, T bound) {
-        const T height = dot(normal, place);
-        visit(normal, bound < height ? bound : height);
-      };
-      for (int n = 0; n < contacts_.plane_count; ++n)
-        no_deeper(contacts_.planes[n].normal, contacts_.planes[n].height);
-      for (int n = 0; n < contacts_.sphere_count; ++n) {
-        const Sphere<T>& sphere = contacts_.spheres[n];
-        const Vec3<T> normal = outward(sphere, place);
-        no_deeper(normal, dot(normal, sphere.center) + sphere.radius);
-      }
+      each_wall(contacts_, place, visit);
     };
   }
 

@@ -1,37 +1,12 @@
 // A static tree of boxes with 32 children a node: the order of its leaves is made once, boxes before every search.
 #pragma once
-#include "math/vec.h"
+#include "contact/box.h"
 
 #include <algorithm>
 #include <cstdint>
 #include <vector>
 
 namespace pd::inline PD_TARGET {
-
-template <class T>
-struct Box {
-  Vec3<T> low, high;
-
-  void add(const Vec3<T>& p) {
-    low = {std::min(low.x, p.x), std::min(low.y, p.y), std::min(low.z, p.z)};
-    high = {std::max(high.x, p.x), std::max(high.y, p.y), std::max(high.z, p.z)};
-  }
-  void add(const Box& other) {
-    add(other.low);
-    add(other.high);
-  }
-  Box widened(T by) const {
-    return {{low.x - by, low.y - by, low.z - by}, {high.x + by, high.y + by, high.z + by}};
-  }
-  bool meets(const Box& other) const {
-    return low.x <= other.high.x && other.low.x <= high.x && low.y <= other.high.y &&
-           other.low.y <= high.y && low.z <= other.high.z && other.low.z <= high.z;
-  }
-  static Box none() {
-    const T far(HUGE_VAL);
-    return {{far, far, far}, {-far, -far, -far}};
-  }
-};
 
 template <class T>
 class BoxTree {

@@ -2,6 +2,7 @@
 // see cuda/elements/group_lanes.h.
 #pragma once
 #include "cuda/common/launch.h"
+#include "cuda/contact/launch.h"
 
 namespace pd::poisson {
 
@@ -32,6 +33,15 @@ std::int64_t mixed_step_bytes(const MixedStep<T>& call) {
   return call.plan.kernel == int(DeviceKernel::stream) ? poisson::mixed_stream_bytes(call)
                                                        : poisson::mixed_block_bytes(call);
 }
+
+template <class T>
+std::int64_t contact_stream_bytes(const WithContact<DeviceStep<T>>& call);
+template <class T>
+void run_contact_stream(const WithContact<DeviceStep<T>>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t contact_mixed_bytes(const WithContact<MixedStep<T>>& call);
+template <class T>
+void run_contact_mixed(const WithContact<MixedStep<T>>& call, void* memory, Stream stream);
 
 template <class T>
 std::int64_t field_bytes(const DeviceField<T>& call);

@@ -167,7 +167,7 @@ class StreamRunner {
 
   void finish() { vertices<VertexTask::finish>(0); }
 
- private:
+ protected:
   void assemble_diagonal() {
     const bool own = own_weights(call_.step);
     const std::int64_t sets = own ? patches_ : plan_.patches;
@@ -189,37 +189,38 @@ class StreamRunner {
     if (call_.step.info) environments<EnvironmentTask::store>(record);
   }
 
-  template <Visit What>
+  // `Projects`: whether vertices are projected out of the planes and spheres of the scene
+  template <Visit What, bool Projects = HasContacts>
   void pass(int k) {
     // Messages of each pipeline pass carry a new number. The first pass of a call writes 0 to every
     // place, so no old message matches. With a tolerance the number is 0 too, and stream_shared
     // waits for the whole pass, since converged environments send nothing.
     const unsigned round = set_.tolerance > 0 ? 0 : ++round_;
-    const bool piped = !stencils_ && pipe<What>(k, round);
-    if (!piped && !run_mixed<What>(k))
-      launcher_.run(stream_patches<What, T, HasContacts>, patches_, pass_threads, pass_shared_,
-                    call_, k);
-    launcher_.run_overlapped(stream_shared<What, T, HasContacts>,
+    const bool piped = !stencils_ && pipe<What, Projects>(k, round);
+    if (!piped && !run_mixed<What, Projects>(k))
+      launcher_.run(stream_patches<What, T, Projects>, patches_, pass_threads, pass_shared_, call_,
+                    k);
+    launcher_.run_overlapped(stream_shared<What, T, Projects>,
                              call_.step.batch * call_.shared_blocks(), shared_threads, 0, call_, k,
                              piped ? round : 0u);
   }
 
   // Runs a pass of a scene with stencils.
-  template <Visit What>
+  template <Visit What, bool Projects>
   bool run_mixed(int k) {
     if (stencils_)
-      run_mixed_pass<T, HasContacts>(What, MixedStreamCall<T>{call_, *stencils_}, patches_,
-                                     pass_shared_, k, stream_);
+      run_mixed_pass<T, Projects>(What, MixedStreamCall<T>{call_, *stencils_}, patches_,
+                                  pass_shared_, k, stream_);
     return stencils_ != nullptr;
   }
 
   // Runs an iteration's patches as a pipeline if shared memory holds two of them. The number of
   // patches has no influence: the pipeline sums in another order, and an environment must have the
   // same bits in any batch.
-  template <Visit What>
+  template <Visit What, bool Projects>
   bool pipe(int k, unsigned round) {
     constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
-    if constexpr (updates && !HasContacts && sizeof(T) == 4 && !has_poisson_ratio) {
+    if constexpr (updates && !Projects && sizeof(T) == 4 && !has_poisson_ratio) {
       const auto kernel = stream_pipeline<What, T>;
       // the pipeline uses 32-bit indices; slots are the largest array of an environment
       constexpr std::int64_t most = std::numeric_limits<std::uint32_t>::max();

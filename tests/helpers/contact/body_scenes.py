@@ -46,6 +46,7 @@ def places_of(sim: pd.Simulator, state: pd.HistoryState, environment: int = 0) -
     """Places of all vertices [N, 3] of an environment, those of colliders last."""
     assert sim.body_contact is not None
     plan = sim.body_contact.plan
+    state = state.to("cpu")
     poses = state.history.poses[environment].double().numpy()
     world = placed(poses[plan.collider[plan.collider >= 0]], plan.points)
     return torch.cat([state.positions[environment].double(), torch.tensor(world)])
@@ -75,7 +76,7 @@ class Course:
         for number in range(count):
             given = None if self.targets is None else self.targets(number)
             if given is not None:
-                given = {part: value.to(sim.dtype) for part, value in given.items()}
+                given = {part: value.to(sim.rest_positions) for part, value in given.items()}
             state, info = sim(state, targets=given, return_info=True)
             yield state, info
 

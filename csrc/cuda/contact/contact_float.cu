@@ -1,0 +1,8 @@
+#include "cuda/contact/kernels.cuh"
+
+namespace pd {
+template std::int64_t contact_bytes(const ContactWork<float>&);
+template void prepare_contact(const ContactWork<float>&, Stream);
+template void keep_displacements(const ContactWork<float>&, Stream);
+template void run_contact(ContactTask, const ContactWork<float>&, int, Stream);
+}  // namespace pd

@@ -1,0 +1,265 @@
+// Kernels of cuda/contact/launch.h: a team of blocks takes one environment after another.
+#pragma once
+#include "cuda/common/arena.h"
+#include "cuda/common/inputs.h"
+#include "cuda/common/runtime.h"
+#include "cuda/common/teams.cuh"
+#include "cuda/contact/launch.h"
+#include "cuda/contact/team.cuh"
+#include "solver/contact/step.h"
+
+#include <algorithm>
+
+namespace pd::inline PD_TARGET {
+
+// Most vertices and parts of surfaces that one block takes alone: several would wait for each other longer.
+constexpr int most_items_of_block = 4096;
+
+template <class T>
+struct ContactMemory {
+  ContactArrays<T> first;  // of the first environment
+  std::int64_t stride;     // bytes between environments
+  double* partial;         // [batch, chunks, 2]
+  int* counts;             // [batch, chunks]
+  unsigned* counter;       // [batch]
+  int* component;          // [vertices]
+  T* saved;                // [batch, vertices, 4]
+};
+
+template <class T>
+struct ContactKernel {
+  ContactWork<T> work;
+  ContactMemory<T> memory;
+  int chunks, teams, blocks, k;
+};
+
+template <class T>
+int count_chunks(const ContactWork<T>& work) {
+  const ContactPlan<T>& plan = work.contact.plan;
+  const std::int64_t most = std::max<std::int64_t>(
+      {plan.vertices, std::int64_t(plan.points) + plan.edges, plan.capacity, work.sum_rows});
+  return int(most / contact_chunk) + 1;
+}
+
+template <class T>
+std::int64_t arrange(const ContactWork<T>& work, void* base, ContactMemory<T>& m) {
+  const auto each = [&](Arena& arena) {
+    arrange(arena, work.contact.plan, std::max(1, work.pieces), m.first);
+  };
+  Arena size(nullptr);
+  each(size);
+  m.stride = size.size();
+  Arena arena(base);
+  const std::int64_t chunks = work.batch * count_chunks(work);
+  arena.place(m.partial, 2 * chunks);
+  arena.place(m.counts, chunks);
+  arena.place(m.counter, work.batch);
+  arena.place(m.component, work.vertices);
+  arena.place(m.saved, work.batch * work.vertices * 4);
+  const std::int64_t shared = arena.size();
+  Arena environments(base ? static_cast<std::byte*>(base) + shared : nullptr);
+  each(environments);
+  return shared + m.stride * work.batch;
+}
+
+template <class T>
+PD_DEVICE BodyState<T> body_state(const ContactKernel<T>& call, std::int64_t e) {
+  const ContactWork<T>& w = call.work;
+  const std::int64_t at = 4 * e * w.vertices;
+  T *const u = w.u + at, *const before = w.before + at, *const target = w.target + at;
+  return {w.order,
+          call.memory.component,
+          w.x + at,
+          u,
+          before,
+          before,
+          target,
+          call.memory.saved + at,
+          u + 3,
+          target + 3,
+          w.material.masses.of(e),
+          4,
+          w.vertices,
+          w.pieces};
+}
+
+template <class T>
+PD_DEVICE ContactEnvironment<T> environment_of(const ContactKernel<T>& call,
+                                               const ContactArrays<T>& arrays, std::int64_t e) {
+  const ContactWork<T>& w = call.work;
+  const ContactPlan<T>& plan = w.contact.plan;
+  const int planes = w.material.planes_count, spheres = w.material.spheres_count;
+  return {plan,
+          arrays,
+          body_state(call, e),
+          {reinterpret_cast<const Plane<T>*>(w.planes) + e * planes,
+           reinterpret_cast<const Sphere<T>*>(w.spheres) + e * spheres, planes, spheres},
+          w.contact.history.poses + e * plan.colliders * 7,
+          w.contact.poses + e * plan.colliders * 7,
+          w.contact.history.keys + e * plan.capacity,
+          w.contact.history.forces + 4 * e * plan.capacity};
+}
+
+template <class T>
+PD_DEVICE void iterate(const ContactKernel<T>& call, const ContactSteps<T>& steps,
+                       const ContactTeam& team, std::int64_t e, int k, bool leads) {
+  const ContactWork<T>& w = call.work;
+  Progress& p = static_cast<Progress*>(w.progress)[e];
+  if (p.done) return;
+  double* const omegas = w.omega + e * guard_period;
+  const double omega = omegas[k % guard_period];
+  const bool guards = p.schedule.checks_energy(k), soft = w.settings.tolerance > 0;
+  double energy[1] = {0};
+  if (guards) {
+    const double* const rows = w.sums + e * w.sum_rows * sums_count;
+    team.sum(w.sum_rows, [&](int n, double (&sum)[1]) { sum[0] += rows[n * sums_count]; }, energy);
+  }
+  double sums[2];
+  const auto merits =
+      steps.iterate(team, k, {T(w.settings.relaxation) * T(omega), guards, soft, energy[0]}, sums);
+  if (!leads) return;
+  ++p.used;
+  omegas[(k + 1) % guard_period] = p.schedule.next(k + 1);
+  if (guards) {
+    p.schedule.last_energy = merits.known ? merits.before : HUGE_VAL;
+    p.schedule.check(merits.now);
+  }
+  if (soft) {
+    const bool rests = steps.is_at_rest();
+    const bool met = p.ends(w.settings.tolerance, omega, rests ? sums[0] : HUGE_VAL, sums[1]);
+    p.done = met && rests && sums[0] < HUGE_VAL;
+  }
+}
+
+// Positions and velocities of an environment whose pairs exceed the capacity stay.
+template <class T>
+PD_DEVICE void take_back(const ContactWork<T>& w, const ContactTeam& team, std::int64_t e) {
+  const std::int64_t count = 3 * std::int64_t(w.vertices), first = e * count;
+  team.spread(count, [&](int n) {
+    w.out_positions[first + n] = w.positions[first + n];
+    w.out_velocities[first + n] = w.velocities[first + n];
+  });
+}
+
+template <ContactTask What, class T>
+__global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 2 : 1)
+    contact_task(const __grid_constant__ ContactKernel<T> call) {
+  __shared__ ContactArrays<T> arrays;
+  const int number = int(blockIdx.x) / call.blocks, thread = int(threadIdx.x);
+  const ContactWork<T>& w = call.work;
+  const ContactPlan<T>& plan = w.contact.plan;
+  BlockTeam blocks(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
+#pragma unroll 1
+  for (std::int64_t e = number; e < w.batch; e += call.teams) {
+    __syncthreads();
+    if (thread < contact_array_pointers)
+      reinterpret_cast<char**>(&arrays)[thread] =
+          reinterpret_cast<char* const*>(&call.memory.first)[thread] + e * call.memory.stride;
+    __syncthreads();
+    const ContactTeam team(blocks, call.memory.partial + 2 * e * call.chunks,
+                           call.memory.counts + e * call.chunks);
+    const ContactEnvironment<T> environment = environment_of(call, arrays, e);
+    const ContactSteps<T> steps(environment);
+    T* const forces = w.contact.forces + 3 * e * plan.vertices;
+    if constexpr (What == ContactTask::start) {
+      steps.start(team);
+      if (blocks.thread() == 0) {
+        Progress& p = static_cast<Progress*>(w.progress)[e];
+        p.used = 0;
+        p.done = false;
+        p.stop = {
+            squared_free_fall(w.vertices, w.settings.time_step, read3(w.material.gravity.of(e)))};
+      }
+    } else if constexpr (What == ContactTask::go_first) {
+      steps.go_first(team);
+    } else if constexpr (What == ContactTask::iterate) {
+      iterate(call, steps, team, e, call.k, blocks.thread() == 0);
+    } else if constexpr (What == ContactTask::go_last) {
+      steps.go_last(team, w.settings.iterations);
+    } else if constexpr (What == ContactTask::finish) {
+      steps.finish(team, forces);
+    } else {
+      const std::int64_t c = e * plan.colliders, m = e * plan.capacity;
+      const ContactHistory<T>& to = w.contact.history;
+      steps.write(team, {to.next_poses + 7 * c, to.next_keys + m, to.next_forces + 4 * m,
+                         w.contact.held_back + c, forces, w.contact.info + e * contact_info_count});
+      if (environment.numbers().most_pairs > plan.capacity) take_back(w, team, e);
+    }
+    team.barrier();
+  }
+}
+
+template <class T>
+__global__ void contact_components(const __grid_constant__ ContactKernel<T> call) {
+  const int s = int(blockIdx.x * blockDim.x + threadIdx.x);
+  if (s < call.work.slots)
+    call.memory.component[call.work.slot_vertex[s]] = call.work.slot_piece[s];
+}
+
+template <ContactTask What, class T>
+void launch_contact(const ContactWork<T>& work, int k, cudaStream_t stream) {
+  ContactKernel<T> call{work, {}, count_chunks(work), 0, 0, k};
+  arrange(work, work.memory, call.memory);
+  const auto* kernel = reinterpret_cast<const void*>(contact_task<What, T>);
+  const int resident = resident_blocks(kernel, contact_threads, 0);
+  const ContactPlan<T>& plan = work.contact.plan;
+  const std::int64_t items = std::max<std::int64_t>(plan.vertices, std::int64_t(plan.edges));
+  const Teams teams(work.batch, resident,
+                    items <= most_items_of_block ? 1 : int(items / contact_threads) + 1);
+  call.teams = teams.blocks > 1 ? teams.count : int(blocks_of(work.batch));
+  call.blocks = teams.blocks;
+  if (call.blocks > 1)
+    return launch_teams(kernel, call, call.memory.counter, contact_threads, 0, stream);
+  contact_task<What, T><<<unsigned(call.teams), contact_threads, 0, stream>>>(call);
+  check(cudaGetLastError());
+}
+
+}  // namespace pd::inline PD_TARGET
+
+namespace pd {
+
+template <class T>
+std::int64_t contact_bytes(const ContactWork<T>& work) {
+  ContactMemory<T> memory;
+  return arrange(work, nullptr, memory);
+}
+
+template <class T>
+void prepare_contact(const ContactWork<T>& work, Stream to) {
+  const auto stream = static_cast<cudaStream_t>(to);
+  ContactKernel<T> call{work, {}, 0, 0, 0, 0};
+  arrange(work, work.memory, call.memory);
+  check(cudaMemsetAsync(call.memory.component, 0xff, work.vertices * sizeof(int), stream));
+  if (work.pieces == 0 || work.slots == 0) return;
+  contact_components<T><<<blocks_of((work.slots + 255) / 256), 256, 0, stream>>>(call);
+  check(cudaGetLastError());
+}
+
+template <class T>
+void keep_displacements(const ContactWork<T>& work, Stream to) {
+  ContactMemory<T> memory;
+  arrange(work, work.memory, memory);
+  check(cudaMemcpyAsync(memory.saved, work.u, work.batch * work.vertices * 4 * sizeof(T),
+                        cudaMemcpyDeviceToDevice, static_cast<cudaStream_t>(to)));
+}
+
+template <class T>
+void run_contact(ContactTask task, const ContactWork<T>& work, int k, Stream to) {
+  const auto stream = static_cast<cudaStream_t>(to);
+  switch (task) {
+    case ContactTask::start:
+      return launch_contact<ContactTask::start>(work, k, stream);
+    case ContactTask::go_first:
+      return launch_contact<ContactTask::go_first>(work, k, stream);
+    case ContactTask::iterate:
+      return launch_contact<ContactTask::iterate>(work, k, stream);
+    case ContactTask::go_last:
+      return launch_contact<ContactTask::go_last>(work, k, stream);
+    case ContactTask::finish:
+      return launch_contact<ContactTask::finish>(work, k, stream);
+    case ContactTask::write:
+      return launch_contact<ContactTask::write>(work, k, stream);
+  }
+}
+
+}  // namespace pd

@@ -1,0 +1,185 @@
+// The contact of one environment while its step runs, for a team of threads that shares its phases.
+//
+// A phase calls a function for every item: vertex, pair, part of a surface, body. Items of a phase do not depend on each
+// other, so any number of threads has the same bits. A team offers
+//
+//   spread(count, item)    a phase; each(count, item): and a barrier, after which all see what it wrote
+//   once(task)             one thread, and a barrier
+//   sum(count, add, sums)  sums of doubles in a fixed order, the same in all threads; scan(numbers, count): prefix sums
+//   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own
+//
+// All threads of a team take the same branches: what they decide by is not written in the phase that follows.
+#pragma once
+#include "contact/box.h"
+#include "contact/pairs/shares.h"
+#include "solver/chebyshev.h"
+#include "solver/contact/shared_numbers.h"
+#include "solver/step.h"
+#include "solver/vertex.h"
+
+#include <cstddef>
+#include <cstdint>
+
+namespace pd::inline PD_TARGET {
+
+// Numbers of an environment, one of each.
+struct ContactNumbers {
+  double checked_energy;
+  int pairs, known, most_pairs, searches, shortened, frozen;
+  int searched_at;
+  int waits, checked;
+  // of an iteration
+  int active, outside, loaded, cut, stopped, meets, changed;
+};
+
+// Arrays of an environment. Vertices have the user's numbers, those of colliders last.
+template <class T>
+struct ContactArrays {
+  Vec3<T>*begin, *place, *target, *goal, *shift, *checked, *end;  // [vertices] m
+  Ball<T>* ball;                                                  // [vertices]
+  T *inverse, *weight, *room;                                     // [vertices]
+  unsigned char *held, *cut, *surface;                            // [vertices]
+  int *start, *cursor;             // [vertices + 1]: entries of a vertex in the list of pairs
+  int* entry;                      // [4 capacity]: pair * 4 + corner, in the order of the pairs
+  ContactPair<T>* pair;            // [capacity] in the order of their keys
+  unsigned char* active;           // [capacity]
+  std::int64_t* known_key;         // [capacity] of the list before
+  Multiplier<T>* known_force;      // [capacity]
+  int *owner, *partner;            // [capacity] parts of a pair
+  int* owner_start;                // [owners + 1] pairs of each vertex, then of each edge
+  int* owner_near;                 // [owners]
+  Box<T>*triangle_box, *edge_box;  // of trees, all levels
+  RigidWay* rigid;                 // [bodies]
+  Box<T>* body_box;                // [bodies]
+  T *together, *alone, *joint, *limit;  // [bodies] shares of ways
+  int *body_begin, *body_end;           // [bodies] vertices
+  int* group;                           // [bodies]
+  unsigned char *own, *pinned, *moves;  // [bodies]
+  Hand<T>* hand;                        // [colliders]
+  Screw<T>* screw;                      // [colliders]
+  T *share, *least, *bound;             // [colliders]
+  int* barred;                          // [colliders]
+  unsigned char* touches;               // [components]
+  T* most;                              // [colliders + 2]: held back, pins held back, least d / r
+  ContactNumbers* numbers;
+};
+
+// Numbers of nodes of a tree over `count` leaves with 32 children a node.
+constexpr int tree_fan = 32;
+PD_HD std::int64_t count_nodes(int count) {
+  std::int64_t all = count;
+  for (int n = count; n > 1;) {
+    n = (n + tree_fan - 1) / tree_fan;
+    all += n;
+  }
+  return all;
+}
+
+// `arena`: place(array, count)
+template <class T, class Arena>
+void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactArrays<T>& a) {
+  const std::int64_t v = plan.vertices, m = plan.capacity, b = plan.bodies, c = plan.colliders,
+                     owners = std::int64_t(plan.points) + plan.edges;
+  for (Vec3<T>** array : {&a.begin, &a.place, &a.target, &a.goal, &a.shift, &a.checked, &a.end})
+    arena.place(*array, v);
+  arena.place(a.ball, v);
+  for (T** array : {&a.inverse, &a.weight, &a.room}) arena.place(*array, v);
+  for (unsigned char** array : {&a.held, &a.cut, &a.surface}) arena.place(*array, v);
+  for (int** array : {&a.start, &a.cursor}) arena.place(*array, v + 1);
+  arena.place(a.entry, 4 * m + 1);
+  arena.place(a.pair, m);
+  arena.place(a.active, m);
+  arena.place(a.known_key, m);
+  arena.place(a.known_force, m);
+  for (int** array : {&a.owner, &a.partner}) arena.place(*array, m);
+  arena.place(a.owner_start, owners + 1);
+  arena.place(a.owner_near, owners);
+  arena.place(a.triangle_box, count_nodes(plan.triangles));
+  arena.place(a.edge_box, count_nodes(plan.edges));
+  arena.place(a.rigid, b);
+  arena.place(a.body_box, b);
+  for (T** array : {&a.together, &a.alone, &a.joint, &a.limit}) arena.place(*array, b);
+  for (int** array : {&a.body_begin, &a.body_end, &a.group}) arena.place(*array, b);
+  for (unsigned char** array : {&a.own, &a.pinned, &a.moves}) arena.place(*array, b);
+  arena.place(a.hand, c);
+  arena.place(a.screw, c);
+  for (T** array : {&a.share, &a.least, &a.bound}) arena.place(*array, c);
+  arena.place(a.barred, c);
+  arena.place(a.touches, components);
+  arena.place(a.most, c + 2);
+  arena.place(a.numbers, 1);
+}
+
+constexpr int contact_array_pointers = int(sizeof(ContactArrays<float>) / sizeof(void*));
+
+// The deforming vertices of a step, by internal number: four numbers each, but for `inverse` and `inertia`.
+template <class T>
+struct BodyState {
+  const int *order, *component;    // user's number; component that moves rigidly, or -1
+  const T* x;                      // at the start of the step
+  T *u, *before;                   // displacement of the iterate, and of the one before
+  const T *free, *target, *saved;  // of the free iterate; s; before a coarse correction
+  const T *inverse, *inertia;      // every `stride` numbers
+  const T* mass;                   // by the user's number
+  int stride, vertices, components;
+
+  PD_HD static Vec3<T> read(const T* of, int i) {
+    const T* p = of + 4 * std::int64_t(i);
+    return {p[0], p[1], p[2]};
+  }
+  PD_HD static void write(T* to, int i, const Vec3<T>& value) {
+    T* p = to + 4 * std::int64_t(i);
+    p[0] = value.x, p[1] = value.y, p[2] = value.z;
+  }
+  PD_HD Vec3<T> place(int i, const Vec3<T>& displacement) const {
+    return read(x, i) + displacement;
+  }
+  PD_HD T inverse_of(int i) const { return inverse[std::int64_t(i) * stride]; }
+  PD_HD Vertex<Thread<T>, true> vertex(int i) const {
+    return {read(x, i), read(target, i), inertia[std::int64_t(i) * stride], inverse_of(i)};
+  }
+};
+
+// What a team works on.
+template <class T>
+struct ContactEnvironment {
+  const ContactPlan<T>& plan;
+  const ContactArrays<T>& a;
+  BodyState<T> body;
+  Contacts<T> walls;
+  const T *poses, *goal_poses;      // [colliders, 7] at the start, and of the step's end
+  const std::int64_t* history_key;  // [capacity]
+  const T* history_force;           // [capacity, 4]
+
+  PD_HD bool held(int v) const { return a.held[v] != 0; }
+  PD_HD int owners() const { return plan.points + plan.edges; }
+  PD_HD ContactNumbers& numbers() const { return *a.numbers; }
+
+  // calls visit(pair, corner) for the pairs of a vertex, in their order
+  template <class Visit>
+  PD_HD void each_of(int v, const Visit& visit) const {
+    for (int n = a.start[v]; n < a.start[v + 1]; ++n) visit(a.entry[n] / 4, a.entry[n] % 4);
+  }
+  PD_HD bool is_stuck(int v) const {
+    bool stuck = false;
+    each_of(v, [&](int p, int) { stuck = stuck || a.pair[p].plane.frozen; });
+    return stuck;
+  }
+  // calls visit(normal, bound) for the planes and spheres of the scene
+  template <class Visit>
+  PD_HD void each_wall(int v, const Vec3<T>& place, const Visit& visit) const {
+    if (!walls.exist() || v >= plan.body_vertices || held(v)) return;
+    pd::each_wall(walls, place, visit);
+  }
+  // calls visit(normal, bound, margin) for all half-spaces of a vertex
+  template <class Visit>
+  PD_HD void each_space(int v, const Visit& visit) const {
+    each_of(
+        v, [&](int p, int corner) { visit_space(a.pair[p].plane, a.pair[p].on_a(corner), visit); });
+    const T here = place_rounding(a.place[v]), there = place_rounding(a.target[v]),
+            margin = here < there ? there : here;
+    each_wall(v, a.place[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,89 @@
+// Numbers that several threads of an environment change at a time. The result depends on no order: counts, and the least or
+// largest of numbers that are not negative, whose bits are ordered as integers. On the host one thread runs alone.
+#pragma once
+#include "math/scalar.h"
+
+#include <cstdint>
+
+namespace pd::inline PD_TARGET {
+
+// Adds one; returns the number before.
+PD_HD int count_one(int* to) {
+#if defined(__CUDA_ARCH__)
+  return atomicAdd(to, 1);
+#else
+  return (*to)++;
+#endif
+}
+
+PD_HD void lower(int* to, int value) {
+#if defined(__CUDA_ARCH__)
+  atomicMin(to, value);
+#else
+  if (value < *to) *to = value;
+#endif
+}
+PD_HD void raise(int* to, int value) {
+#if defined(__CUDA_ARCH__)
+  atomicMax(to, value);
+#else
+  if (*to < value) *to = value;
+#endif
+}
+
+// `value` and the number at hand are not negative, nor -0
+PD_HD void lower(float* to, float value) {
+#if defined(__CUDA_ARCH__)
+  atomicMin(reinterpret_cast<int*>(to), __float_as_int(value));
+#else
+  if (value < *to) *to = value;
+#endif
+}
+PD_HD void lower(double* to, double value) {
+#if defined(__CUDA_ARCH__)
+  atomicMin(reinterpret_cast<long long*>(to), __double_as_longlong(value));
+#else
+  if (value < *to) *to = value;
+#endif
+}
+PD_HD void raise(float* to, float value) {
+#if defined(__CUDA_ARCH__)
+  atomicMax(reinterpret_cast<int*>(to), __float_as_int(value));
+#else
+  if (*to < value) *to = value;
+#endif
+}
+PD_HD void raise(double* to, double value) {
+#if defined(__CUDA_ARCH__)
+  atomicMax(reinterpret_cast<long long*>(to), __double_as_longlong(value));
+#else
+  if (*to < value) *to = value;
+#endif
+}
+
+// Joins the groups of two members, each named by its least member: `group` is a forest of links to lesser ones.
+PD_HD void join(int* group, int a, int b) {
+#if defined(__CUDA_ARCH__)
+  while (a != b) {
+    const int least = a < b ? a : b, most = a < b ? b : a;
+    const int before = atomicMin(group + most, least);
+    if (before == most) return;
+    a = before;
+    b = least;
+  }
+#else
+  while (a != b) {
+    const int least = a < b ? a : b, most = a < b ? b : a, before = group[most];
+    if (least < before) group[most] = least;
+    if (before == most) return;
+    a = before;
+    b = least;
+  }
+#endif
+}
+PD_HD int root_of(const int* group, int member) {
+  while (group[member] != member) member = group[member];
+  return member;
+}
+
+}  // namespace pd::inline PD_TARGET

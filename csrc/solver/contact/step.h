@@ -1,0 +1,513 @@
+// One step with contact between bodies, for a team: what lies between the passes over elements. A runner calls
+//
+//   start; [coarse correction] go_first; for k: [free iterate, energy] iterate(k); [coarse correction] go_last; finish; write
+#pragma once
+#include "solver/contact/approach.h"
+
+namespace pd::inline PD_TARGET {
+
+template <class T>
+class ContactSteps {
+ public:
+  using Env = ContactEnvironment<T>;
+
+  PD_HD explicit ContactSteps(const Env& env)
+      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env) {}
+
+  // A step begins at the places of bodies; poses are those of colliders, actual ones and those of the step's end.
+  template <class Team>
+  PD_HD void start(const Team& team) const {
+    team.spread(plan_.vertices, [&](int v) { a_.surface[v] = 0; });
+    team.spread(body_.vertices, [&](int i) {
+      const int v = body_.order[i];
+      a_.place[v] = a_.begin[v] = body_.place(i, {T(0), T(0), T(0)});
+      a_.inverse[v] = body_.inverse_of(i);
+      a_.held[v] = !(body_.inverse_of(i) > T(0));
+      a_.goal[v] = body_.place(i, BodyState<T>::read(body_.target, i));
+    });
+    team.each(plan_.vertices - plan_.body_vertices, [&](int n) {
+      const int v = plan_.body_vertices + n, c = plan_.collider[v];
+      const bool first = n == 0 || plan_.collider[v - 1] != c,
+                 last = v + 1 == plan_.vertices || plan_.collider[v + 1] != c;
+      const Pose<T> pose = Hand<T>::read(env_.poses + 7 * c),
+                    goal = Hand<T>::read(env_.goal_poses + 7 * c);
+      if (first) a_.hand[c].pose = pose, a_.hand[c].goal = goal, a_.hand[c].begin = v;
+      if (last) a_.hand[c].end = v + 1;
+      a_.place[v] = a_.begin[v] = pose.place(local_point(plan_, v));
+      a_.goal[v] = goal.place(local_point(plan_, v));
+      a_.inverse[v] = T(0);
+      a_.held[v] = 1;
+    });
+    team.spread(plan_.points, [&](int n) { a_.surface[plan_.point[n]] = 1; });
+    team.once([&] {
+      ContactNumbers numbers = {};
+      // keys increase, and -1 pads them
+      int begin = 0, end = plan_.capacity;
+      while (begin < end) {
+        const int middle = (begin + end) / 2;
+        if (env_.history_key[middle] >= 0) {
+          begin = middle + 1;
+        } else {
+          end = middle;
+        }
+      }
+      numbers.known = begin;
+      env_.numbers() = numbers;
+    });
+  }
+
+  // Approach, search and the first iterate, as near to the corrected guess as the promise allows.
+  template <class Team>
+  PD_HD void go_first(const Team& team) const {
+    const ContactApproach<T> approach(env_, search_);
+    const int known = env_.numbers().known;
+    restore_touching(team, [&](const auto& touch) {
+      team.each(known, [&](int n) {
+        const std::int64_t of = env_.history_key[n];
+        const bool edges = of >= first_edge_key(plan_);
+        const std::int64_t key = edges ? of - first_edge_key(plan_) : of,
+                           count = edges ? plan_.edges : plan_.triangles;
+        const int a = edges ? plan_.edge[2 * (key / count)] : int(key / count),
+                  b = edges ? plan_.edge[2 * (key % count)] : plan_.triangle[3 * (key % count)];
+        if (plan_.body[a] == plan_.body[b]) return;
+        touch(a);
+        touch(b);
+      });
+    });
+    want(team, body_.u);
+    approach.move(team);
+    search_.find(team, true);
+    // What was stopped starts where it was: nearer to its guess it would only be squashed.
+    team.each(plan_.vertices, [&](int v) {
+      a_.cut[v] = 0;
+      if (!env_.held(v) && approach.was_stopped(plan_.body[v])) a_.target[v] = a_.place[v];
+    });
+    double none[2];
+    go(team, false, none);
+    team.each(body_.vertices,
+              [&](int i) { BodyState<T>::write(body_.before, i, BodyState<T>::read(body_.u, i)); });
+  }
+
+  // At the end bodies that touch no other are corrected again.
+  template <class Team>
+  PD_HD void go_last(const Team& team, int iterations) const {
+    if (body_.components == 0) return;
+    const int pairs = env_.numbers().pairs;
+    restore_touching(team, [&](const auto& touch) {
+      team.each(pairs, [&](int p) {
+        touch(a_.pair[p].vertex[0]);
+        touch(a_.pair[p].vertex[3]);
+      });
+    });
+    want(team, body_.u);
+    watch(team, pairs);
+    prepare(team, iterations);
+    double none[2];
+    go(team, false, none);
+  }
+
+  // An iteration of a step, from the free iterate without contact. `energy`: E at the iterate, if the schedule checks it.
+  // `sums`: squares of the change, and of the displacement from the target, with a tolerance.
+  struct Iteration {
+    T c;  // theta omega
+    bool guards, measures;
+    double energy;
+  };
+  struct Merits {
+    double before, now;
+    bool known;
+  };
+  template <class Team>
+  PD_HD Merits iterate(const Team& team, int k, const Iteration& of, double (&sums)[2]) const {
+    const int pairs = env_.numbers().pairs;
+    team.spread(pairs, [&](int p) {
+      ContactPair<T>& pair = a_.pair[p];
+      look(pair);
+    });
+    want(team, body_.free);
+    Merits merits{};
+    if (of.guards) merits = check(team, pairs, of.energy);
+    if (pairs > 0) prox(team, pairs, of.c);
+    if (env_.walls.exist()) {
+      team.spread(body_.vertices, [&](int i) {
+        Vec3<T>& target = a_.target[body_.order[i]];
+        const Vec3<T> u = target - BodyState<T>::read(body_.x, i);
+        target =
+            body_.place(i, body_.vertex(i).project(env_.walls, u, BodyState<T>::read(body_.u, i)));
+      });
+      team.barrier();
+    }
+    watch(team, pairs);
+    prepare(team, k);
+    go(team, of.measures, sums);
+    return merits;
+  }
+
+  // whether all go as they want
+  PD_HD bool is_at_rest() const { return !env_.numbers().cut && !env_.numbers().waits; }
+
+  // At the end of a step: forces on every vertex [vertices, 3] N.
+  template <class Team>
+  PD_HD void finish(const Team& team, T* forces) const {
+    const int pairs = env_.numbers().pairs;
+    team.each(plan_.colliders + 2,
+              [&](int n) { a_.most[n] = n < plan_.colliders + 1 ? T(0) : T(HUGE_VAL); });
+    team.each(pairs, [&](int p) {
+      ContactPair<T>& pair = a_.pair[p];
+      look(pair);
+      lower(a_.most + plan_.colliders + 1, pair.near.distance / pair.thickness);
+    });
+    team.each(plan_.vertices, [&](int v) {
+      Vec3<T> force = {T(0), T(0), T(0)};
+      env_.each_of(v, [&](int p, int corner) {
+        const ContactPair<T>& pair = a_.pair[p];
+        const Vec3<T> each = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
+        force = multiply_add(pair.near.weight[corner], each, force);
+      });
+      T* const to = forces + 3 * std::int64_t(v);
+      to[0] = force.x, to[1] = force.y, to[2] = force.z;
+      if (!env_.held(v)) return;
+      const Vec3<T> left = a_.place[v] - a_.goal[v];
+      const int number = v < plan_.body_vertices ? plan_.colliders : plan_.collider[v];
+      raise(a_.most + number, square_root(dot(left, left)));
+    });
+  }
+
+  // Poses, forces and numbers of the contact, for the caller. An overflow takes the step back: then nothing has changed, and
+  // no force acts. `next`: the history of this environment.
+  struct Output {
+    T* poses;
+    std::int64_t* keys;
+    T *forces, *held_back, *vertex_forces;
+    double* info;
+  };
+  template <class Team>
+  PD_HD void write(const Team& team, const Output& to) const {
+    const ContactNumbers& numbers = env_.numbers();
+    const bool overflows = numbers.most_pairs > plan_.capacity;
+    const int pairs = overflows ? 0 : numbers.pairs;
+    team.each(pairs, [&](int p) { a_.entry[p] = a_.pair[p].has_force(); });
+    team.scan(a_.entry, pairs);
+    const int count = a_.entry[pairs];
+    team.spread(pairs, [&](int p) {
+      const int at = a_.entry[p];
+      if (a_.entry[p + 1] == at) return;
+      const Multiplier<T>& of = a_.pair[p].force;
+      write_force(to, at, a_.pair[p].key, of.normal, of.tangential);
+    });
+    team.spread(plan_.capacity, [&](int n) {
+      const T* f = env_.history_force + 4 * std::int64_t(n);
+      if (overflows) {
+        write_force(to, n, env_.history_key[n], f[0], {f[1], f[2], f[3]});
+      } else if (n >= count) {
+        write_force(to, n, -1, T(0), {T(0), T(0), T(0)});
+      }
+    });
+    if (overflows) team.spread(3 * plan_.vertices, [&](int n) { to.vertex_forces[n] = T(0); });
+    team.spread(plan_.colliders, [&](int c) {
+      const Pose<T> pose = overflows ? Hand<T>::read(env_.poses + 7 * c) : a_.hand[c].pose;
+      Hand<T>::write(pose, to.poses + 7 * c);
+      to.held_back[c] = a_.most[c];
+    });
+    team.once([&] {
+      to.info[contact_gap] = double(a_.most[plan_.colliders + 1]);
+      to.info[contact_overflow] = overflows ? double(numbers.most_pairs - plan_.capacity) : 0;
+      to.info[contact_pairs] = numbers.most_pairs;
+      to.info[contact_searches] = numbers.searches;
+      to.info[contact_shortened] = numbers.shortened;
+      to.info[contact_frozen] = numbers.frozen;
+      to.info[contact_pins_held_back] = double(a_.most[plan_.colliders]);
+      to.info[contact_residual] = NAN;
+    });
+  }
+
+ private:
+  PD_HD static void write_force(const Output& to, int at, std::int64_t key, T normal,
+                                const Vec3<T>& tangential) {
+    to.keys[at] = key;
+    T* const f = to.forces + 4 * std::int64_t(at);
+    f[0] = normal, f[1] = tangential.x, f[2] = tangential.y, f[3] = tangential.z;
+  }
+
+  // Takes back the coarse correction of components with a vertex of each_touching(touch).
+  template <class Team, class Each>
+  PD_HD void restore_touching(const Team& team, const Each& each_touching) const {
+    if (body_.components == 0) return;
+    team.each(body_.components, [&](int g) { a_.touches[g] = 0; });
+    // components by the user's numbers
+    team.each(body_.vertices, [&](int i) { a_.cursor[body_.order[i]] = body_.component[i]; });
+    each_touching([&](int v) {
+      const int g = v < plan_.body_vertices ? a_.cursor[v] : -1;
+      if (g >= 0) a_.touches[g] = 1;
+    });
+    team.each(body_.vertices, [&](int i) {
+      const int g = body_.component[i];
+      if (g >= 0 && a_.touches[g])
+        BodyState<T>::write(body_.u, i, BodyState<T>::read(body_.saved, i));
+    });
+  }
+
+  // Targets of the next move: displacements of bodies, and the goals of what moves by hand. What iterations count begins.
+  template <class Team>
+  PD_HD void want(const Team& team, const T* displacement) const {
+    team.spread(body_.vertices, [&](int i) {
+      const int v = body_.order[i];
+      a_.target[v] =
+          env_.held(v) ? a_.goal[v] : body_.place(i, BodyState<T>::read(displacement, i));
+    });
+    team.spread(plan_.vertices - plan_.body_vertices, [&](int n) {
+      const int v = plan_.body_vertices + n;
+      a_.target[v] = a_.goal[v];
+    });
+    team.once([&] {
+      ContactNumbers& numbers = env_.numbers();
+      numbers.active = numbers.outside = numbers.loaded = numbers.cut = 0;
+    });
+  }
+
+  // Closest points and normal at the present iterate.
+  PD_HD void look(ContactPair<T>& pair) const {
+    Vec3<T> corner[4];
+    pair.corners(a_.place, corner);
+    pair.near = closest_points(pair.edges, corner);
+    pair.normal = pair.normal_at(pair.near);
+  }
+
+  // E + psi at the last check and now, both by the list and the multipliers of now.
+  template <class Team>
+  PD_HD Merits check(const Team& team, int pairs, double energy) const {
+    ContactNumbers& numbers = env_.numbers();
+    const bool checked = numbers.checked != 0;
+    double sums[2] = {numbers.checked_energy, energy};
+    team.sum(
+        pairs,
+        [&](int p, double (&sum)[2]) {
+          const ContactPair<T>& pair = a_.pair[p];
+          const T yielding = pair.yielding(a_.inverse);
+          const auto psi = [&](const Vec3<T>* places, const Closest<T>& at) {
+            return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction,
+                                        at.distance,
+                                        pair.template slip<const Vec3<T>*>(places, a_.begin, at));
+          };
+          if (checked) {
+            Vec3<T> corner[4];
+            pair.corners(a_.checked, corner);
+            sum[0] += psi(a_.checked, closest_points(pair.edges, corner));
+          }
+          sum[1] += psi(a_.place, pair.near);
+        },
+        sums);
+    team.spread(plan_.vertices, [&](int v) { a_.checked[v] = a_.place[v]; });
+    team.once([&] { numbers.checked_energy = energy, numbers.checked = 1; });
+    return {sums[0], sums[1], checked};
+  }
+
+  // The proximal step: multipliers in the metric of D, and what they move. c = theta omega.
+  template <class Team>
+  PD_HD void prox(const Team& team, int pairs, T c) const {
+    ContactNumbers& numbers = env_.numbers();
+    team.each(pairs, [&](int p) {
+      ContactPair<T>& pair = a_.pair[p];
+      a_.active[p] = 0;
+      if (!(pair.freedom(a_.inverse) > T(least_yield))) {
+        pair.force = {};  // nothing can yield
+        return;
+      }
+      Vec3<T> corner[4];
+      pair.corners(a_.target, corner);
+      const bool touches = dot(pair.normal, combined(pair.near.weight, corner)) < pair.thickness;
+      if (!touches && !(pair.force.normal > T(0))) return;
+      a_.active[p] = 1;
+      numbers.active = 1;
+    });
+    if (!numbers.active) return;
+    push(team, c, true, false);
+    for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
+      team.each(pairs, [&](int p) {
+        if (!a_.active[p]) return;
+        ContactPair<T>& pair = a_.pair[p];
+        Vec3<T> between[4], before[4];
+        pair.corners(a_.shift, between);
+        pair.corners(a_.begin, before);
+        const T beta = T(1) / (c * row_bound(pair, a_.weight, a_.inverse));
+        pair.force =
+            advance(pair.force, beta, pair.thickness, pair.friction, pair.normal,
+                    combined(pair.near.weight, between), combined(pair.near.weight, before));
+      });
+      push(team, c, false, sweep + 1 == contact_sweeps);
+    }
+  }
+
+  // Targets, shifted by the forces of active pairs. `first`: with S of every vertex; `last`: they become the targets.
+  template <class Team>
+  PD_HD void push(const Team& team, T c, bool first, bool last) const {
+    team.each(plan_.vertices, [&](int v) {
+      if (a_.start[v] == a_.start[v + 1]) return;
+      Vec3<T> shift = a_.target[v];
+      T weight(0);
+      bool touched = false;
+      env_.each_of(v, [&](int p, int corner) {
+        if (!a_.active[p]) return;
+        const ContactPair<T>& pair = a_.pair[p];
+        const Vec3<T> force = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
+        weight = weight + absolute(pair.near.weight[corner]);
+        shift = multiply_add(c * pair.near.weight[corner] * a_.inverse[v], force, shift);
+        touched = true;
+      });
+      a_.shift[v] = shift;
+      if (first) a_.weight[v] = weight;
+      if (last && touched) a_.target[v] = shift;
+    });
+  }
+
+  // Finds whether a vertex wants to leave its ball, and whether a pair has a force.
+  template <class Team>
+  PD_HD void watch(const Team& team, int pairs) const {
+    ContactNumbers& numbers = env_.numbers();
+    team.spread(pairs, [&](int p) {
+      if (a_.pair[p].force.normal != T(0)) numbers.loaded = 1;
+    });
+    team.each(plan_.vertices, [&](int v) {
+      Vec3<T> target = a_.target[v];
+      if (move_into(a_.ball[v], target)) numbers.outside = 1;
+      a_.cut[v] = 0;
+    });
+  }
+
+  // Before the move of iteration k: a search if a vertex wants to leave its ball, else planes that targets violate are made
+  // anew at the present iterate. Searches pause while pairs have forces.
+  template <class Team>
+  PD_HD void prepare(const Team& team, int k) const {
+    ContactNumbers& numbers = env_.numbers();
+    const int pairs = numbers.pairs, since = k - numbers.searched_at;
+    const bool outside = numbers.outside != 0, due = since >= search_pause || !numbers.loaded;
+    if (outside && due) {
+      team.barrier();  // all have read
+      team.once([&] { numbers.waits = 0, numbers.searched_at = k; });
+      search_.find(team, false);
+      return;
+    }
+    team.spread(1, [&](int) { numbers.waits = outside; });
+    team.each(pairs, [&](int p) {
+      ContactPair<T>& pair = a_.pair[p];
+      if (breaks(pair, a_.target))
+        make_plane(pair, a_.place, a_.target, pair.near, pair.plane.normal);
+    });
+  }
+
+  PD_HD void cut(int v) const {
+    a_.cut[v] = 1;
+    env_.numbers().cut = 1;
+    count_one(&env_.numbers().shortened);
+  }
+
+  PD_HD bool is_allowed_at(int v, const Vec3<T>& to) const {
+    return is_allowed(to, a_.ball[v], [&](const auto& visit) { env_.each_space(v, visit); });
+  }
+
+  // Moves toward the targets. `sums`: see iterate
+  template <class Team>
+  PD_HD void go(const Team& team, bool measures, double (&sums)[2]) const {
+    const auto move = [&](int i, double (&sum)[2]) {
+      const int v = body_.order[i];
+      move_vertex(v);
+      const Vec3<T> u = BodyState<T>::read(body_.u, i),
+                    next = a_.place[v] - BodyState<T>::read(body_.x, i), way = next - u;
+      BodyState<T>::write(body_.u, i, next);
+      BodyState<T>::write(body_.before, i, a_.cut[v] ? next : u);
+      if (!measures) return;
+      const Vec3<T> off = next - BodyState<T>::read(body_.target, i);
+      sum[0] += double(dot(way, way));
+      sum[1] += double(dot(off, off));
+    };
+    sums[0] = sums[1] = 0;
+    if (measures) {
+      team.sum(body_.vertices, move, sums);
+    } else {
+      team.each(body_.vertices, [&](int i) {
+        double none[2] = {};
+        move(i, none);
+      });
+    }
+    if (plan_.colliders > 0) move_hands(team);
+  }
+
+  PD_HD void move_vertex(int v) const {
+    const Vec3<T> from = a_.place[v];
+    if (env_.held(v)) {
+      const Vec3<T> goal = a_.goal[v], way = goal - from;
+      const auto at = [&](T share) { return share < T(1) ? multiply_add(share, way, from) : goal; };
+      const T share =
+          env_.is_stuck(v) ? T(0) : largest_share<T>([&](T s) { return is_allowed_at(v, at(s)); });
+      if (share > T(0)) a_.place[v] = at(share);
+      if (share < T(1)) cut(v);
+      return;
+    }
+    if (env_.is_stuck(v)) {
+      cut(v);
+      count_one(&env_.numbers().frozen);
+      return;
+    }
+    const LimitedPlace<T> to = limit(a_.target[v], from, a_.ball[v],
+                                     [&](const auto& visit) { env_.each_space(v, visit); });
+    a_.place[v] = to.place;
+    if (to.shortened) cut(v);
+  }
+
+  // Colliders by the largest shares of their screws that all their vertices allow.
+  template <class Team>
+  PD_HD void move_hands(const Team& team) const {
+    ContactNumbers& numbers = env_.numbers();
+    const int own = plan_.vertices - plan_.body_vertices;
+    team.spread(1, [&](int) { numbers.stopped = 0; });
+    team.each(plan_.colliders, [&](int c) {
+      a_.barred[c] = 0;
+      a_.screw[c] = Screw<T>(a_.hand[c].pose, a_.hand[c].goal);
+      a_.share[c] = T(1);
+    });
+    // barred: 1 by the share that is tried, 2 by a frozen pair
+    const auto try_shares = [&](bool all) {
+      team.each(own, [&](int n) {
+        const int v = plan_.body_vertices + n, c = plan_.collider[v];
+        if (all && env_.is_stuck(v)) {
+          raise(a_.barred + c, 2);
+        } else if ((all || a_.share[c] < a_.bound[c]) && a_.barred[c] == 0 &&
+                   !is_allowed_at(v, a_.screw[c].at(a_.share[c]).place(local_point(plan_, v)))) {
+          raise(a_.barred + c, 1);
+        }
+      });
+    };
+    try_shares(true);
+    team.each(plan_.colliders, [&](int c) {
+      a_.least[c] = a_.barred[c] ? T(0) : T(1);
+      a_.bound[c] = a_.barred[c] == 1 ? T(1) : a_.least[c];  // no more trials
+      if (a_.barred[c] == 1) numbers.stopped = 1;
+    });
+    const bool stopped = numbers.stopped != 0;
+    // as largest_share
+    for (int n = 0; stopped && n < share_halvings; ++n) {
+      team.each(plan_.colliders, [&](int c) {
+        a_.barred[c] = 0;
+        a_.share[c] = T(0.5) * (a_.least[c] + a_.bound[c]);
+      });
+      try_shares(false);
+      team.each(plan_.colliders,
+                [&](int c) { (a_.barred[c] ? a_.bound[c] : a_.least[c]) = a_.share[c]; });
+    }
+    team.each(plan_.colliders, [&](int c) { a_.share[c] = a_.least[c]; });
+    team.each(plan_.colliders, [&](int c) { a_.hand[c].pose = a_.screw[c].at(a_.share[c]); });
+    team.each(own, [&](int n) {
+      const int v = plan_.body_vertices + n, c = plan_.collider[v];
+      a_.place[v] = a_.hand[c].pose.place(local_point(plan_, v));
+      if (a_.share[c] < T(1)) cut(v);
+    });
+  }
+
+  const Env& env_;
+  const ContactPlan<T>& plan_;
+  const ContactArrays<T>& a_;
+  const BodyState<T>& body_;
+  const ContactSearch<T> search_;
+};
+
+}  // namespace pd::inline PD_TARGET

@@ -1,0 +1,205 @@
+"""Contact between bodies on a GPU: as on the CPU, free of crossings, the same bits in any batch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from body_scenes import (
+    THICKNESS,
+    Course,
+    G,
+    ball_on_sheet,
+    crossed,
+    folded_sheet,
+    gripper,
+    plates,
+    simulator,
+    slope,
+    two_cubes,
+)
+from devices import require_gpu
+from on_gpu import GPU, host_waits
+from runs import noise
+from torch import Tensor
+
+import torchpd as pd
+
+require_gpu()
+
+_COURSES: dict[str, tuple[Callable[[], Course], int]] = {
+    "two cubes": (two_cubes, 12),
+    "ball on a sheet": (ball_on_sheet, 8),
+    "plates": (lambda: plates(-0.002)[0], 24),
+    "gripper": (lambda: gripper(0.8), 24),
+    "folded sheet": (lambda: folded_sheet(self_contact=True), 12),
+}
+
+
+def arrays(state: pd.HistoryState) -> list[Tensor]:
+    return [state.positions, state.velocities, *state.history]
+
+
+def same_bits(one: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
+    return all(torch.allclose(a, b, rtol=0.0, atol=0.0, equal_nan=True) for a, b in zip(one, other, strict=True))
+
+
+def on_gpu(course: Course, iterations: int, dtype: torch.dtype = torch.float64, **options: Any) -> pd.Simulator:
+    return simulator(course.scene, iterations, dtype=dtype, device=GPU, **options)
+
+
+@pytest.mark.parametrize("iterations", [4, 16, 64])
+@pytest.mark.parametrize("name", _COURSES)
+def test_a_step_equals_that_of_the_cpu(name: str, iterations: int) -> None:
+    """Each step from the state of the CPU: the same pairs, places to 1e-9 of the longest way, forces to 1e-6.
+
+    Only sums over elements and energies have another order. A pair whose force is at rounding may come and go.
+    """
+    make, count = _COURSES[name]
+    course = make()
+    host, device = simulator(course.scene, iterations), on_gpu(course, iterations)
+    before = course.start(host)
+    for number, (state, info) in enumerate(course.steps(host, count)):
+        given = None if course.targets is None else course.targets(number)
+        moved = None if given is None else {part: value.to(device.rest_positions) for part, value in given.items()}
+        own, report = device(before.to(GPU), targets=moved, return_info=True)
+        way = max(float((state.positions - before.positions).abs().max()), 1e-6)
+        assert float((own.positions.cpu() - state.positions).abs().max()) <= 1e-9 * way
+        torch.testing.assert_close(own.history.poses.cpu(), state.history.poses, rtol=0.0, atol=1e-9)
+        assert float(report.contact_gap) == pytest.approx(float(info.contact_gap), rel=1e-6)
+        assert float(report.held_back) == pytest.approx(float(info.held_back), rel=1e-6, abs=1e-12)
+        most = float(state.history.forces.abs().max())
+        normal, theirs = (s.history.forces[..., 0].sum().item() for s in (own, state))
+        assert normal == pytest.approx(theirs, rel=1e-6, abs=1e-6 * most)
+        before = state
+
+
+@pytest.mark.parametrize("iterations", [4, 16, 64])
+@pytest.mark.parametrize("name", _COURSES)
+def test_surfaces_do_not_cross(name: str, iterations: int, dtype: torch.dtype) -> None:
+    make, count = _COURSES[name]
+    course = make()
+    sim = on_gpu(course, iterations, dtype)
+    least = math.inf
+    for state, info in course.steps(sim, count):
+        assert crossed(sim, state) == 0
+        assert state.positions.isfinite().all()
+        assert int(info.contact_overflow) == 0
+        least = min(least, float(info.contact_gap))
+    assert 0.099 <= least < 20.0
+
+
+@pytest.mark.parametrize("name", ["two cubes", "gripper", "ball on a sheet"])
+@pytest.mark.parametrize("tolerance", [0.0, 1e-2])
+def test_runs_and_batches_do_not_matter(name: str, tolerance: float, dtype: torch.dtype) -> None:
+    """300 environments of other velocities, after steps in which most of them touch: each as alone, and every time."""
+    course = _COURSES[name][0]()
+    sim = on_gpu(course, 24, dtype, tolerance=tolerance)
+    start: Any = sim.rest_state(300)
+    if course.velocities is not None:
+        start.velocities[:] = torch.tensor(course.velocities, device=GPU)
+    start.velocities.add_(0.1 * noise(start.velocities))
+
+    def run(state: Any) -> list[Tensor]:
+        rows = []
+        for number in range(6):
+            given = None if course.targets is None else course.targets(4 * number)
+            moved = None if given is None else {part: value.to(sim.rest_positions) for part, value in given.items()}
+            state, info = sim(state, targets=moved, return_info=True)
+            rows += [*arrays(state), *info]
+        return rows
+
+    together = run(start)
+    assert float(together[-3].min()) < 5.0  # least distances over the thickness
+    assert same_bits(run(start), together)
+    for item in (0, 1, 131, 299):
+        alone = pd.HistoryState(
+            *(array[item : item + 1] for array in start[:2]),
+            type(start.history)(*(array[item : item + 1] for array in start.history)),
+        )
+        assert same_bits(run(alone), [array[item : item + 1] for array in together])
+
+
+def test_a_team_of_blocks_has_the_bits_of_one(dtype: torch.dtype) -> None:
+    """A sheet of 3600 cells: alone many blocks work on it, and one each in a batch of 700."""
+    course = folded_sheet(self_contact=True, cells=60)
+    sim = on_gpu(course, 12, dtype)
+    start: Any = sim.rest_state(700)
+    start.velocities[:] = torch.tensor(course.velocities, device=GPU)
+    alone = course.start(sim)
+    for _ in range(4):
+        start, alone = sim(start), sim(alone)
+    assert int((alone.history.keys >= 0).sum()) > 0
+    for item in (0, 699):
+        assert same_bits([array[item : item + 1] for array in arrays(start)], arrays(alone))
+
+
+@pytest.mark.parametrize("iterations", [32, 64])
+def test_a_cube_at_rest(iterations: int, dtype: torch.dtype) -> None:
+    """1 kg: forces of 9.81 N to 1e-4, at the thickness to 1e-6 m; its residual counts them."""
+    course = slope(0.0, 0.0)
+    sim = on_gpu(course, iterations, dtype)
+    state, info = course.last(sim, 40)
+    assert float(state.history.forces[..., 0].sum()) == pytest.approx(G, rel=1e-4)
+    assert float(state.positions[..., 1].min()) == pytest.approx(THICKNESS, abs=1e-6)
+    assert float(info.contact_gap) == pytest.approx(1.0, abs=1e-3)
+    assert float(info.residual) < 1e-2
+
+
+def test_overflow_is_of_one_environment() -> None:
+    """Only where pairs exceed the capacity the step is taken back; other environments have the bits they have alone."""
+    course = two_cubes()
+    scene = pd.Scene(*course.scene.parts[:-1], pd.Contact(friction=0.5, thickness=THICKNESS, capacity=40))
+    sim = simulator(scene, 16, device=GPU)
+    state: Any = sim.rest_state(3)
+    state.velocities[1] = torch.tensor(course.velocities, device=GPU)
+    for _ in range(8):
+        before = state
+        state, info = sim(state, return_info=True)
+    over = info.contact_overflow.tolist()
+    assert over[1] > 0
+    assert over[0] == over[2] == 0
+    assert same_bits([a[1] for a in arrays(state)], [a[1] for a in arrays(before)])
+    alone: Any = sim.rest_state(1)
+    for _ in range(8):
+        alone = sim(alone)
+    for item in (0, 2):
+        assert same_bits([a[item : item + 1] for a in arrays(state)], arrays(alone))
+
+
+def test_the_host_does_not_wait() -> None:
+    course = gripper(0.8)
+    sim = on_gpu(course, 8, torch.float32)
+    state = course.start(sim)
+    targets = {part: value.to(sim.rest_positions) for part, value in course.targets(0).items()}  # type: ignore[misc]
+    sim(state, targets=targets)
+    assert not host_waits(lambda: sim(state, targets=targets, return_info=True))
+
+
+@pytest.mark.parametrize("name", ["two cubes", "gripper", "ball on a sheet"])
+def test_a_replay_is_a_step_in_place(name: str, dtype: torch.dtype) -> None:
+    course = _COURSES[name][0]()
+    sim = on_gpu(course, 16, dtype)
+    own, eager = course.start(sim), course.start(sim)
+    targets = None
+    if course.targets is not None:
+        targets = {part: value.to(sim.rest_positions).clone() for part, value in course.targets(0).items()}
+    step = sim.capture(own, targets=targets, return_info=True)
+    assert same_bits(arrays(own), arrays(eager))
+    for number in range(1, 8):
+        if targets is not None and course.targets is not None:
+            for part, value in course.targets(4 * number).items():
+                targets[part].copy_(value)
+        step.replay()
+        sim.step_(eager, targets=targets)
+        assert same_bits(arrays(own), arrays(eager))
+    assert np.isfinite(float(step.info.residual))
+
+
+def test_other_kernels_are_refused() -> None:
+    with pytest.raises(ValueError, match="in a scene with Contact on a GPU, got 'block'"):
+        on_gpu(two_cubes(), 4, kernel="block")

@@ -1,0 +1,20 @@
+"""Steps with contact on a GPU, for compute-sanitizer: every task of csrc/cuda/contact, by one block and by many."""
+
+from __future__ import annotations
+
+import torch
+from body_scenes import folded_sheet, gripper, simulator, two_cubes
+
+if __name__ == "__main__":
+    torch.cuda.init()
+    for course, batch in ((two_cubes(), 3), (gripper(0.8), 2), (folded_sheet(self_contact=True, cells=45), 1)):
+        sim = simulator(course.scene, 7, dtype=torch.float32, device="cuda")
+        state = sim.rest_state(batch)
+        if course.velocities is not None:
+            state.velocities[:] = torch.tensor(course.velocities)
+        for number in range(4):
+            given = None if course.targets is None else course.targets(8 * number)
+            moved = None if given is None else {part: value.to(sim.rest_positions) for part, value in given.items()}
+            state, info = sim(state, targets=moved, return_info=True)
+        assert float(info.contact_gap.min()) > 0.09
+        assert int((state.history.keys >= 0).sum()) > 0
