@@ -77,7 +77,6 @@ class BodyContact:
                 "the way of; leave it out"
             )
         self.check_transforms(state[0], state[1], *material)
-        _refuse_gradients(state, forces, poses, material)
         before = ContactHistory(*state[2])  # type: ignore[misc]
         history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.contiguous()]
         wanted = history[0] if poses is None else poses.contiguous()
@@ -93,7 +92,7 @@ class BodyContact:
         own = torch.stack([numbers[:, _GAP], numbers[:, _MISSING], held_back], dim=1)
         # the residual of other scenes would count forces between bodies as unbalanced
         rows = torch.cat([numbers[:, _UNBALANCED, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
-        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
+        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes.detach(), flow)), rows
 
     @staticmethod
     def check_transforms(*given: Tensor) -> None:
@@ -140,20 +139,3 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype) -> list[Tensor]:
     reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction, [plan.thickness]]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     return [*map(whole, [sizes, *surfaces, *trees]), keys, *map(real, reals)]
-
-
-def _refuse_gradients(
-    state: State | HistoryState, forces: Tensor | None, poses: Tensor | None, material: list[Tensor]
-) -> None:
-    if not torch.is_grad_enabled():
-        return
-    named = {"positions": state[0], "velocities": state[1], "forces": forces, "poses of colliders": poses}
-    named |= {f"history.{name}": array for name, array in zip(ContactHistory._fields, state[2], strict=True)}  # type: ignore[misc]
-    name = next((name for name, array in named.items() if array is not None and array.requires_grad), None)
-    if name is None and any(array.requires_grad for array in material):
-        name = "material or targets"
-    if name is not None:
-        raise RuntimeError(
-            f"a step with Contact must not require gradients, got {name} that do; its derivative is not provided: "
-            "detach() them, or step under torch.no_grad()"
-        )
