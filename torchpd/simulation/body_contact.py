@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..ops.fake_kernels import CONTACT_FRICTION
 from ..plan.contact_plan import ContactPlan, contact_plan
 from ..plan.contact_start import check_start
 from ..scene.contact import placed
@@ -41,6 +42,28 @@ class BodyContact:
     def to(self, dtype: torch.dtype) -> BodyContact:
         """The same in another precision, whose rounding must be below the thickness."""
         return BodyContact._in_precision(self.plan, dtype)
+
+    @property
+    def friction(self) -> Tensor:
+        """Coulomb's coefficient between bodies [Q, Q]: those of the scene in its order, then colliders."""
+        return self.arrays[CONTACT_FRICTION]
+
+    def with_friction(self, friction: Tensor | float) -> BodyContact:
+        """The same with other coefficients, [] for all pairs or [Q, Q], through which gradients flow."""
+        old = self.friction
+        given = torch.as_tensor(friction, dtype=old.dtype)
+        fix = "set the values of sim.contact_friction, or a number for all pairs"
+        if given.shape not in ((), old.shape):
+            raise ValueError(f"contact_friction must be [] or {list(old.shape)}, got {list(given.shape)}; {fix}")
+        table = given.expand(old.shape).contiguous()
+        values = table.detach().double().numpy()
+        if not (np.isfinite(values).all() and (values >= 0.0).all()):
+            raise ValueError(f"contact_friction must be finite and >= 0, got {values.min():.6g} to {values.max():.6g}")
+        if not np.array_equal(values, values.T):
+            raise ValueError(f"contact_friction must be the same for (a, b) and (b, a), got another; {fix}")
+        arrays = list(self.arrays)
+        arrays[CONTACT_FRICTION] = table
+        return replace(self, plan=replace(self.plan, friction=values.copy()), arrays=arrays)
 
     @staticmethod
     def _in_precision(plan: ContactPlan, dtype: torch.dtype) -> BodyContact:
@@ -78,11 +101,13 @@ class BodyContact:
             )
         self.check_transforms(state[0], state[1], *material)
         before = ContactHistory(*state[2])  # type: ignore[misc]
-        history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.contiguous()]
+        history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.detach().contiguous()]
         wanted = history[0] if poses is None else poses.contiguous()
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
             state[0], state[1], forces, wanted, history, material, plan, self.arrays, **settings
         )
+        # reports, whose loss the op refuses
+        rows, numbers, held, pushes = (report.detach() for report in (rows, numbers, held, pushes))
         flow = before.flow
         if flow.shape[-2]:
             (after,) = _ops.next_history(positions, material, plan, time_step=settings["time_step"])
@@ -92,7 +117,7 @@ class BodyContact:
         own = torch.stack([numbers[:, _GAP], numbers[:, _MISSING], held_back], dim=1)
         # the residual of other scenes would count forces between bodies as unbalanced
         rows = torch.cat([numbers[:, _UNBALANCED, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
-        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes.detach(), flow)), rows
+        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
 
     @staticmethod
     def check_transforms(*given: Tensor) -> None:

@@ -274,3 +274,26 @@ CASES = {
     "cloth over a cube": cloth_over_cube,
     "clamp": clamp,
 }
+
+
+def on_rough_ground() -> Step:
+    """Two cubes on ground that is rough, the upper one with stiffness-proportional damping; the lower one slides."""
+    lower, upper = block(0.1, 1, (0.0, 0.05, 0.0)), block(0.08, 1, (0.013, 0.1412, 0.009), rotation(0.0, 15.0, 0.0))
+    upper = pd.Solid(upper.mesh, youngs=1e5, density=1000.0, stiffness_damping=0.01)
+    ground = pd.Ground(0.0, friction=0.2)
+    scene = pd.Scene(lower, upper, ground, gravity(), pd.Contact(friction=0.3, thickness=THICKNESS))
+    return prepared(scene, [[0.5, 0.0, 0.2]] * 8 + [[1.5, -0.2, 0.05]] * 8, 2)
+
+
+def on_pins() -> Step:
+    """A cube whose bottom is pinned, between a smooth sphere of the scene and a tetrahedron that falls on it."""
+    cube = block(0.1, 2, (0.0, -0.05, 0.0))
+    bottom = cube.mesh.vertices[:, 1] < -0.1 + 1e-9
+    body = tetrahedron([[0.012, 0.0015, 0.02], [0.06, 0.1, 0.0], [-0.05, 0.1, 0.05], [0.0, 0.1, -0.06]])
+    ball = pd.Sphere((0.0995, -0.002, 0.003), 0.05)
+    scene = pd.Scene(cube, body, ball, pd.Pin(cube, bottom), gravity(), pd.Contact(friction=0.2, thickness=THICKNESS))
+    return prepared(scene, [[0.0, 0.0, 0.0]] * 27 + [[0.4, -0.5, 0.1]] * 4, 2)
+
+
+# with planes, spheres, pins and damping, which the reference lacks
+WITH_SCENE = {"rough ground": on_rough_ground, "sphere and pins": on_pins}
