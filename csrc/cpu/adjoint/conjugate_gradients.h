@@ -134,7 +134,11 @@ class ConjugatePass {
   }
 
   void begin(Conjugate& numbers) {
-    if constexpr (HasPairs) leave_pairs_at_first();
+    double whole = 0;
+    if constexpr (HasPairs) {
+      whole = square(residual());
+      leave_pairs(residual());
+    }
     const double weighted = cycle_ ? apply_levels() : 0;
     each_part([&](std::int64_t i, Sum& sums) {
       const Quad<T> right = residual()[i];
@@ -146,6 +150,11 @@ class ConjugatePass {
     });
     const auto sum = total(1);
     numbers.begin(sum.first, cycle_ ? weighted : sum.second);
+    // the pairs may take all of it but rounding: errors are relative to what was there before
+    if (HasPairs && numbers.active) {
+      numbers.scale = std::sqrt(whole);
+      numbers.check_residual(sum.first, call_.tolerance);
+    }
     team_.barrier();  // before the next sums stand there
   }
 
@@ -307,20 +316,13 @@ class ConjugatePass {
                            [&](int i, const Vec3<double>& a) { field[i] = plus(field[i], a); });
   }
 
-  // The same of the right side; what only rounding leaves is zero.
-  void leave_pairs_at_first() {
-    const auto square = [&] {
-      double sum = 0;
-      for (std::int64_t i = 0; i < plan_.vertices; ++i) {
-        const Vec3<double> a = in_double(residual()[i]);
-        sum += dot(a, a);
-      }
-      return sum;
-    };
-    const double whole = square(), rounding = 16 * double(std::numeric_limits<T>::epsilon());
-    leave_pairs(residual());
-    if (!(square() <= rounding * rounding * whole)) return;
-    std::fill_n(residual(), plan_.vertices, to_quad<T>(0, 0, 0));
+  double square(const Quad<T>* field) const {
+    double sum = 0;
+    for (std::int64_t i = 0; i < plan_.vertices; ++i) {
+      const Vec3<double> a = in_double(field[i]);
+      sum += dot(a, a);
+    }
+    return sum;
   }
 
   // Adds what the pairs have of the matrix, transposed or by its symmetric part, times a field.
