@@ -68,6 +68,39 @@ class Approach {
     }
   }
 
+  // A direction with the largest gap at both ends, and the gap that must be kept along it: the floor, or the gap at the start
+  // where that is less. If no direction has it at both ends, the one with the largest gap at the start is taken.
+  struct Kept {
+    Vec3<T> normal;
+    T least;
+  };
+  static Kept direction_of(const ContactPair<T>& pair, const Vec3<T> (&start)[4],
+                           const Vec3<T> (&end)[4]) {
+    const bool edges = pair.edges;
+    const Closest<T> first = closest_points(edges, start), last = closest_points(edges, end);
+    Vec3<T> by_a{T(0), T(0), T(0)}, by_b = by_a, own = by_a, both = by_a;
+    for (int a = 0; a < 4; ++a) {
+      Vec3<T>& side = pair.on_a(a) ? by_a : by_b;
+      side = side + (end[a] - start[a]);
+    }
+    const T on_a(edges ? 2 : 1), on_b(edges ? 2 : 3);
+    const Vec3<T> relative = (T(1) / on_a) * by_a - (T(1) / on_b) * by_b;
+    const T square = dot(relative, relative);
+    const T share = dot(first.diff, relative) / (square > T(0) ? square : T(1));
+    T largest = T(-HUGE_VAL), lower = T(-HUGE_VAL);
+    const auto consider = [&](const Vec3<T>& normal) {
+      const T before = gap_along(edges, normal, start), after = gap_along(edges, normal, end);
+      const T smaller = before < after ? before : after;
+      if (before > largest) largest = before, own = normal;
+      if (smaller > lower) lower = smaller, both = normal;
+    };
+    each_candidate(edges, start, first, consider);
+    visit_unit(subtract_product(first.diff, share, relative), consider);
+    each_candidate(edges, end, last, consider);
+    const T least = largest < pair.floor() ? largest : pair.floor();
+    return {lower >= least ? both : own, least};
+  }
+
   // Whether a body came less far than it wanted.
   bool was_stopped(int body) const { return together_[body] < T(1); }
 
@@ -159,39 +192,6 @@ class Approach {
                               const T gap = gap_along(pair.edges, kept.normal, end);
                               own_[b] = !(gap < kept.least) && kept.least > gap_bound(end);
                             });
-  }
-
-  // A direction with the largest gap at both ends, and the gap that must be kept along it: the floor, or the gap at the start
-  // where that is less. If no direction has it at both ends, the one with the largest gap at the start is taken.
-  struct Kept {
-    Vec3<T> normal;
-    T least;
-  };
-  static Kept direction_of(const ContactPair<T>& pair, const Vec3<T> (&start)[4],
-                           const Vec3<T> (&end)[4]) {
-    const bool edges = pair.edges;
-    const Closest<T> first = closest_points(edges, start), last = closest_points(edges, end);
-    Vec3<T> by_a{T(0), T(0), T(0)}, by_b = by_a, own = by_a, both = by_a;
-    for (int a = 0; a < 4; ++a) {
-      Vec3<T>& side = pair.on_a(a) ? by_a : by_b;
-      side = side + (end[a] - start[a]);
-    }
-    const T on_a(edges ? 2 : 1), on_b(edges ? 2 : 3);
-    const Vec3<T> relative = (T(1) / on_a) * by_a - (T(1) / on_b) * by_b;
-    const T square = dot(relative, relative);
-    const T share = dot(first.diff, relative) / (square > T(0) ? square : T(1));
-    T largest = T(-HUGE_VAL), lower = T(-HUGE_VAL);
-    const auto consider = [&](const Vec3<T>& normal) {
-      const T before = gap_along(edges, normal, start), after = gap_along(edges, normal, end);
-      const T smaller = before < after ? before : after;
-      if (before > largest) largest = before, own = normal;
-      if (smaller > lower) lower = smaller, both = normal;
-    };
-    each_candidate(edges, start, first, consider);
-    visit_unit(subtract_product(first.diff, share, relative), consider);
-    each_candidate(edges, end, last, consider);
-    const T least = largest < pair.floor() ? largest : pair.floor();
-    return {lower >= least ? both : own, least};
   }
 
   // Places after a share of the ways.
