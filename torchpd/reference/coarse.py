@@ -234,6 +234,7 @@ def correct(
     *,
     motions: MotionsOf = RigidMotions,
     push_pairs: bool = True,
+    passes: int = PASSES,
 ) -> Correction:
     """The coarse correction of every island.
 
@@ -244,6 +245,7 @@ def correct(
         pairs: contacts between bodies, with their forces at the iterate.
         motions: makes the motions of an island.
         push_pairs: whether pairs push their vertices after the motion. An iteration with their multipliers does it, too.
+        passes: most states of an island with pairs at which Phi is looked at.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
     energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
@@ -251,7 +253,8 @@ def correct(
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, push, each, energy = _correct_island(moving, forces, own, push_pairs)
+        most = PASSES if own is None else passes
+        corrected, push, each, energy = _correct_island(moving, forces, own, push_pairs, most)
         pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
         energies[problem.values.component[[body[0] for body in bodies]]] = energy
@@ -282,7 +285,7 @@ def islands(
 
 
 def _correct_island(
-    motions: Motions, forces: Array, pairs: PairContacts | None, push_pairs: bool
+    motions: Motions, forces: Array, pairs: PairContacts | None, push_pairs: bool, passes: int
 ) -> tuple[Array, Array, Array, float]:
     """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
@@ -292,7 +295,7 @@ def _correct_island(
 
     contacts = contacts_of(motions)
     radius = contacts.friction * contacts.normal_anchors
-    phi, moved, left = motions.energy + contacts.energy(radius), 0.0, PASSES - 1
+    phi, moved, left = motions.energy + contacts.energy(radius), 0.0, passes - 1
     while True:
         hessian, force = _newton_terms(motions, contacts, radius)
         # a line has no inertia about itself

@@ -93,42 +93,33 @@ class CoarseContact {
     }
   }
 
+  // Whether the motions found are to be made.
+  bool is_valid() const { return island_.is_valid(); }
+
   // Moves an island as far along its motions as other bodies let it, with the forces of its pairs; returns the share.
   double move(ContactRun<T>& run, const Workspace<Lanes>& w, int root) {
-    double most = 1;
-    for (int g : bodies_[root]) {
-      const double size = length(turn_of(local_[g]));
-      if (size > 2) most = std::min(most, 2 / size);
-    }
-    const auto go = [&](double share) { place(w, root, most * share); };
-    go(1);
+    place(w, root, 1);
     find_bounds(run, w, root);
-    const auto allowed = [&](double share) {
-      go(share);
-      for (std::size_t n = 0; n < across_.size(); ++n) {
-        Vec3<T> corner[4];
-        across_[n].corners(next_, corner);
-        const T gap = gap_along(across_[n].edges, kept_[n].normal, corner);
-        if (gap < kept_[n].least || gap <= gap_bound(corner)) return false;
-      }
-      return true;
+    const double share = largest_share<double>([&](double s) {
+      place(w, root, s);
+      return keeps_apart();
+    });
+    place(w, root, share);
+    each_moving(w, root, [&](int, int v) {
+      if (share > 0) run.place()[v] = next_[v];
+      next_[v] = run.place()[v];
+    });
+    const auto motion = [&](int n) -> const RigidMotion<double>& {
+      return motion_[bodies_[root][n]];
     };
-    const double share = largest_share<double>(allowed);
-    go(share);
-    if (!(share > 0)) each_moving(w, root, [&](int, int v) { next_[v] = run.place()[v]; });
-    each_moving(w, root, [&](int, int v) { run.place()[v] = next_[v]; });
     for (const CoarsePair& pair : island_.pairs) {
       const Vec3<double> force =
-          most * share < 1 ? island_.force_after(pair,
-                                                 [&](int n) -> const RigidMotion<double>& {
-                                                   return motion_[bodies_[root][n]];
-                                                 })
-                           : island_.force(pair);
+          share < 1 ? island_.force_after(pair, motion) : island_.force(pair);
       const double normal = dot(force, pair.normal);
       run.set_force(pair.number,
                     {T(normal > 0 ? normal : 0.0), narrow(tangential(force, pair.normal))});
     }
-    return most * share;
+    return share;
   }
 
   // Displacement of a vertex by the whole motion of its body.
@@ -152,12 +143,6 @@ class CoarseContact {
 
   const RigidMotion<double>& motion_of(int component) const {
     return island_.bodies[local_[component]].motion();
-  }
-
-  // w of the turn by 2 atan(|w| / 2): Cayley's formula backward
-  Vec3<double> turn_of(int body) const {
-    const Mat3<double>& turn = island_.bodies[body].motion().turn;
-    return (2.0 / (4.0 + trace(turn))) * axis_of(turn);
   }
 
   int root(int g) const {
@@ -215,7 +200,7 @@ class CoarseContact {
       const RigidMotion<double>& whole = motion_of(g);
       motion_[g] = whole;
       if (share < 1) {
-        motion_[g].turn = small_turn(share * turn_of(local_[g]));
+        motion_[g].turn = small_turn(share * island_.turn(local_[g]));
         motion_[g].shift = share * whole.shift;
       }
     }
@@ -269,6 +254,17 @@ class CoarseContact {
       pair.corners(next_, end);
       kept_.push_back(Approach<T>::direction_of(pair, start, end));
     }
+  }
+
+  // Whether the pairs that bound a way are apart at its end.
+  bool keeps_apart() const {
+    for (std::size_t n = 0; n < across_.size(); ++n) {
+      Vec3<T> corner[4];
+      across_[n].corners(next_, corner);
+      const T gap = gap_along(across_[n].edges, kept_[n].normal, corner);
+      if (gap < kept_[n].least || gap <= gap_bound(corner)) return false;
+    }
+    return true;
   }
 
   const ContactPlan<T>& contact_;

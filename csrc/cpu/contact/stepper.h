@@ -154,6 +154,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     for (int g = 0; g < plan_.components; ++g) {
       if (!asks(g, alone)) continue;
       coarse_.template find<HasContacts>(run_, w_, g, contacts_);
+      if (!coarse_.is_valid()) continue;
       const T share(coarse_.move(run_, w_, g));
       cut = cut || share < T(1);
       coarse_.each_vertex(g, [&](int i) {

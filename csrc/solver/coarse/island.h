@@ -5,6 +5,7 @@
 // and slip follow the motions of its two points, along the normal of the iterate:
 //   gap = d - r + n . m,   slip = t + (1 - n n^T) m,   m = m_A - m_B,   m_A = (R - 1) arm + v of the body of side A
 #pragma once
+#include "contact/pairs/multiplier.h"
 #include "solver/coarse/newton.h"
 
 #include <vector>
@@ -30,6 +31,8 @@ struct CoarsePair {
     return {normal, gap + dot(normal, move), slip + tangential(move, normal)};
   }
 };
+
+constexpr int most_island_passes = 64;
 
 class CoarseIsland {
  public:
@@ -66,7 +69,7 @@ class CoarseIsland {
       done_ = bodies[0].is_done();
       return;
     }
-    done_ = ++passes_ > most_passes;
+    done_ = ++passes_ > most_island_passes;
     if (done_) return;
     matrix_.assign(rows_ * rows_, 0.0);
     right_.assign(rows_, 0.0);
@@ -93,13 +96,38 @@ class CoarseIsland {
     decide();
   }
 
-  // The force of a pair after the motions.
+  // The force of a pair, changed by the motions. What its gap and slip at the iterate add is left to iterations: forces that
+  // grow with them while nothing yields would swing.
   Vec3<double> force(const CoarsePair& pair) const {
     const auto accepted = [&](int n) -> const RigidMotion<double>& { return bodies[n].accepted_; };
-    return pair.envelope().force(pair.after(move_of(pair, accepted)), pair.radius);
+    const Envelope<double> envelope = pair.envelope();
+    const Surface<double> at = pair.after(move_of(pair, accepted));
+    const Vec3<double> after = envelope.force(at, pair.radius);
+    const double radius = pair.friction * envelope.normal_force(at.gap);
+    const Vec3<double> before = envelope.force(pair.after({0, 0, 0}), radius);
+    const Vec3<double> force = envelope.anchor(pair.normal) + (after - before);
+    const double along = dot(force, pair.normal), normal = along > 0 ? along : 0.0;
+    const Vec3<double> across = onto_disc(tangential(force, pair.normal), pair.friction * normal);
+    return multiply_add(normal, pair.normal, across);
   }
 
-  // The same after others, motion_of(body), by a radius of their own.
+  // w of the turn of a body by 2 atan(|w| / 2): Cayley's formula backward.
+  Vec3<double> turn(int body) const {
+    const Mat3<double>& turn = bodies[body].accepted_.turn;
+    return (2.0 / (4.0 + trace(turn))) * axis_of(turn);
+  }
+
+  // Whether no body turns by more than a right angle: where one does, other pairs would hold it.
+  bool is_valid() const {
+    bool valid = true;
+    for (int n = 0; n < int(bodies.size()); ++n) {
+      const Vec3<double> w = turn(n);
+      valid = valid && 4.0 + trace(bodies[n].accepted_.turn) > 0 && !(dot(w, w) > 4.0);
+    }
+    return valid;
+  }
+
+  // The force at the gap and slip after other motions, motion_of(body).
   template <class Motion>
   Vec3<double> force_after(const CoarsePair& pair, const Motion& motion_of) const {
     const Envelope<double> envelope = pair.envelope();

@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ..envelopes import PairContacts
+from ..envelopes import Envelopes, PairContacts
 from ..objective import Objective
 from .approach import directions_of
 from .distance import Closest
@@ -30,7 +30,7 @@ from .planes import gap_along, gap_bounds
 from .search import boxed_pairs
 from .surfaces import Pairs, Surfaces
 
-__all__ = ["RigidWay", "pairs_between", "share_of"]
+__all__ = ["RigidWay", "changed_forces", "pairs_between", "share_of"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -81,6 +81,22 @@ def pairs_between(
     )
 
 
+def changed_forces(before: Envelopes, after: Array) -> Array:
+    """Forces [m, 3] N of pairs, changed by motions from those of the envelopes `before` to `after` [m, 3] N.
+
+    What gaps and slips of the iterate add is left to iterations: forces that grow with them while nothing yields would
+    swing.
+    """
+    bound = before.friction * (after * before.normals).sum(axis=1)
+    anchors = before.normal_anchors[:, None] * before.normals + before.tangent_anchors
+    forces = anchors + (after - before.forces(bound))
+    normal = np.maximum(0.0, (forces * before.normals).sum(axis=1))
+    across = before.tangential(forces)
+    size, bound = np.linalg.norm(across, axis=1), before.friction * normal
+    share = np.where(size > bound, bound / np.where(size > bound, size, 1.0), 1.0)
+    return np.asarray(normal[:, None] * before.normals + share[:, None] * across)
+
+
 @dataclass(frozen=True)
 class RigidWay:
     """The motion of a body about a centre: arms turn by 2 atan(|w| / 2) about w, the centre shifts."""
@@ -102,9 +118,9 @@ class RigidWay:
         return RigidWay(vertices, before - center, center, last - turn @ (first - center) - center, axis)
 
     @property
-    def most(self) -> float:
-        """The share that turns by a right angle, or 1."""
-        return min(1.0, 2.0 / max(float(np.linalg.norm(self.turn)), 1e-300))
+    def is_valid(self) -> bool:
+        """Whether it turns by a right angle at most: where a body turns further, other pairs would hold it."""
+        return bool(np.linalg.norm(self.turn) <= 2.0)
 
     @property
     def chords(self) -> Array:

@@ -31,7 +31,7 @@ from ..problem import StepProblem, step_problem
 from ..schedules import Guarded
 from ..solvers import guard_tolerance
 from .approach import approach
-from .coarse import RigidWay, pairs_between, share_of
+from .coarse import RigidWay, changed_forces, pairs_between, share_of
 from .distance import Closest
 from .hands import Hands
 from .limit import Walls, into_balls, limit
@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 CHECK = 4  # iterations between checks of the guard
 PAUSE = 5  # least iterations between searches: a guard that every search blinds would never see a rise
 SWEEPS = 4
-PUSH = False
+PASSES = 64
 TRIALS = 4
 EVERY = 8  # iterations between coarse corrections
 
@@ -256,7 +256,7 @@ class _Run:
         near = contacts.near(x)
         push = forces(contacts.pairs, near.weights, contacts.normals(near), contacts.held, len(x))
         gradient = np.where(problem.free[:, None], problem.gradient(u) - _array(push[: scene.count]), 0.0)
-        moved = correct(problem, u, pushes_of(problem, u, gradient), pairs, push_pairs=PUSH)
+        moved = correct(problem, u, pushes_of(problem, u, gradient), pairs, push_pairs=False, passes=PASSES)
         rigid, swept, cut, places = moved.displacement - moved.pushes, False, False, x
         normal, tangential = contacts.held.normal.clone(), contacts.held.tangential.clone()
         pushes = torch.zeros_like(x)
@@ -269,7 +269,8 @@ class _Run:
                 RigidWay.between(body, (problem.positions + u)[body], (problem.positions + rigid)[body], center)
                 for body, (center, _) in zip(motions.free, motions.bases, strict=True)
             ]
-            most = min(way.most for way in ways)
+            if not all(way.is_valid for way in ways):
+                continue
             moving, chords = torch.zeros(len(x), dtype=torch.bool), torch.zeros_like(self.inverse)
             for way in ways:
                 moving[torch.as_tensor(way.vertices)] = True
@@ -280,24 +281,24 @@ class _Run:
                 out = here.clone()
                 for way in ways:
                     own = torch.as_tensor(way.vertices)
-                    out[own] = torch.as_tensor(way.at(most * share)).to(x.dtype)
+                    out[own] = torch.as_tensor(way.at(share)).to(x.dtype)
                 return out
 
             share, leaves = share_of(scene.surfaces, component, None if swept else contacts, here, after, chords, moving)
-            self.shares.append(share * most)
+            self.shares.append(share)
             swept |= leaves
             places = after(share) if share > 0.0 else here
-            share *= most
             pushes[torch.as_tensor(own)] = share * torch.as_tensor(moved.pushes[own]).to(x.dtype)
             cut |= share < 1.0
             index = torch.as_tensor(numbers[of])
-            each = moved.forces[of]
+            chosen = pairs.chosen(of)
             if share < 1.0:
-                own_pairs = pairs.chosen(of)
-                at = pair_envelopes(problem, own_pairs, self._displacement(places))
-                each = at.forces(own_pairs.friction * at.normal_forces())
+                at = pair_envelopes(problem, chosen, self._displacement(places))
+                each = at.forces(chosen.friction * at.normal_forces())
+            else:
+                each = changed_forces(pair_envelopes(problem, chosen, u), moved.forces[of])
             each = torch.as_tensor(each).to(x.dtype)
-            n = torch.as_tensor(pairs.normals[of]).to(x.dtype)
+            n = torch.as_tensor(chosen.normals).to(x.dtype)
             normal[index] = (each * n).sum(dim=1)
             tangential[index] = each - normal[index, None] * n
         held = Multipliers(normal.clamp(min=0.0), tangential)
