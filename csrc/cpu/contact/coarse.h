@@ -14,6 +14,7 @@ namespace pd::inline PD_TARGET {
 
 // Of the chord of a turn up to a right angle: how far a share of it leaves the straight way.
 constexpr double turn_bow = 0.25;
+constexpr int coarse_halvings = 6;  // of the interval of a share: another motion follows one that is cut
 
 template <class T>
 class CoarseContact {
@@ -100,10 +101,11 @@ class CoarseContact {
   double move(ContactRun<T>& run, const Workspace<Lanes>& w, int root) {
     place(w, root, 1);
     find_bounds(run, w, root);
-    const double share = largest_share<double>([&](double s) {
+    const auto allowed = [&](double s) {
       place(w, root, s);
       return keeps_apart();
-    });
+    };
+    const double share = largest_share<double>(allowed, coarse_halvings);
     place(w, root, share);
     each_moving(w, root, [&](int, int v) {
       if (share > 0) run.place()[v] = next_[v];

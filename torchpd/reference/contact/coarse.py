@@ -35,6 +35,7 @@ __all__ = ["RigidWay", "changed_forces", "pairs_between", "share_of"]
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
+HALVINGS = 6  # of the interval of a share: another motion follows one that is cut
 BOW = 0.25  # of the chord of a turn up to a right angle: how far a share of it leaves the straight way
 
 
@@ -170,7 +171,7 @@ def share_of(
         gap = gap_along(normals[:, None], corners, pairs.points)[:, 0]
         return ~((gap < least) | (gap <= gap_bounds(corners))).any()[None]
 
-    share = float(halved(allowed, torch.zeros(1, dtype=torch.bool), places.dtype)[0])
+    share = float(halved(allowed, torch.zeros(1, dtype=torch.bool), places.dtype, HALVINGS)[0])
     return share, swept
 
 
