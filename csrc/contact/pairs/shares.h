@@ -11,10 +11,10 @@ constexpr int share_halvings = 30;  // of the interval of a share
 
 // The largest share in [0, 1] that is allowed, if 0 is, and with it all smaller ones.
 template <class T, class Allowed>
-PD_HD T largest_share(const Allowed& allowed) {
+PD_HD T largest_share(const Allowed& allowed, int halvings = share_halvings) {
   if (allowed(T(1))) return T(1);
   T least(0), most(1);
-  for (int n = 0; n < share_halvings; ++n) {
+  for (int n = 0; n < halvings; ++n) {
     const T middle = T(0.5) * (least + most);
     (allowed(middle) ? least : most) = middle;
   }

@@ -16,9 +16,10 @@ void contact_step_with(const StepCall<T>& call, const ContactCall<T>& contact, i
     Scratch<Lanes> scratch(call.plan.most_slots);
     ContactRun<T> run(contact.plan);
     Approach<T> approach(contact.plan);
+    CoarseContact<T> coarse(contact.plan, call.plan);
     const Team alone = team.alone();
     for (std::int64_t e = next++; e < call.batch && !alone.ended(0); e = next++)
-      ContactStepper<T, HasContacts>(call, work, scratch, alone, e, contact, run, approach)
+      ContactStepper<T, HasContacts>(call, work, scratch, alone, e, contact, run, approach, coarse)
           .rollout();
   });
 }

@@ -33,6 +33,7 @@ class ContactRun {
   Places& target() { return target_; }            // of the next one, before contact
   Places& goal() { return goal_; }                // of what moves by hand
   std::vector<T>& inverse() { return inverse_; }  // 1 / D; 0 for what moves by hand
+  const Places& begin_places() const { return begin_; }  // at the step's start
   const PairList<T>& list() const { return list_; }
   bool moves_by_hand(int vertex) const { return held_[vertex] != 0; }
   bool was_cut(int vertex) const { return cut_[vertex] != 0; }
@@ -151,6 +152,19 @@ class ContactRun {
     return merits;
   }
 
+  // After a coarse correction: forces of a pair; the last check says nothing more.
+  void set_force(int pair, const Multiplier<T>& force) { list_.pairs[pair].force = force; }
+  void forget_check() { checked_ = false; }
+
+  bool leaves_ball(int v, Vec3<T> place) const { return move_into(balls_[v], place); }
+
+  // Planes that `to` violates are made anew at the present iterate.
+  void refresh(const Places& to) {
+    for (ContactPair<T>& pair : list_.pairs) {
+      if (breaks(pair, to)) make_plane(pair, place_, to, pair.near, pair.plane.normal);
+    }
+  }
+
   // The proximal step: multipliers in the metric of D, and what they move. c = theta omega.
   void prox(T c) {
     active_.clear();
@@ -224,7 +238,7 @@ class ContactRun {
     for (const ContactPair<T>& pair : list_.pairs) loaded = loaded || pair.force.normal != T(0);
     const bool due = k - searched_at_ >= search_pause || !loaded;
     waits_ = outside && !due;
-    if (!outside || !due) return refresh();
+    if (!outside || !due) return refresh(target_);
     searched_at_ = k;
     find();
   }
@@ -301,13 +315,6 @@ class ContactRun {
         const int v = pair.vertex[a];
         shift_[v] = multiply_add(c * pair.near.weight[a] * inverse_[v], force, shift_[v]);
       }
-    }
-  }
-
-  // Planes that targets violate are made anew at the present iterate.
-  void refresh() {
-    for (ContactPair<T>& pair : list_.pairs) {
-      if (breaks(pair, target_)) make_plane(pair, place_, target_, pair.near, pair.plane.normal);
     }
   }
 
