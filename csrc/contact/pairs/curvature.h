@@ -211,7 +211,9 @@ struct PairSlopes {
   T load[12][12];   // of -w (x) f, by the corners at the end
   T row[3][12];     // of the gap and of the slips, by these: C
   T column[3][12];  // of w (x) f by the multipliers: B
-  T stiffness;      // mu lambda / |s| of a pair that slides [N/m]
+  // of a pair that slides, else 0: mu lambda / |s| [N/m], by which its slip turns across
+  T stiffness;
+  Vec3<T> across;
 
   PD_HD void set(const LoadedPair<T>& pair, const Vec3<T> (&end)[4], const Vec3<T> (&start)[4]) {
     differentiate(pair, end, start, true, load, row);
@@ -227,7 +229,9 @@ struct PairSlopes {
       }
     }
     const Vec3<T> slip = pair_slip(terms.frame, end, start);
-    stiffness = slides ? pair.friction * lambda / square_root(dot(slip, slip)) : T(0);
+    const T length = square_root(dot(slip, slip));
+    stiffness = slides ? pair.friction * lambda / length : T(0);
+    across = (slides ? T(1) / length : T(0)) * cross(terms.frame.normal, slip);
   }
 
   // Derivatives by the corners at the end or at the start.

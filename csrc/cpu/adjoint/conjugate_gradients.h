@@ -201,7 +201,7 @@ class ConjugatePass {
   // Continues with BiCGStab where vertices slide, after so many products; returns whether it has.
   bool solve_friction(const Conjugate& numbers, int products) {
     if (!call_.friction || !continues_with_friction(numbers, call_.tolerance)) return false;
-    if (!some_slide() && !(HasPairs && pairs_->rows().skewed())) return false;
+    if (!some_slide() && !(HasPairs && pairs_->some())) return false;
     FrictionSolve friction(nullptr, numbers.scale);
     friction.begin(products, adjoint_iterations);
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
@@ -325,10 +325,10 @@ class ConjugatePass {
     return sum;
   }
 
-  // Adds what the pairs have of the matrix, transposed or by its symmetric part, times a field.
-  void add_pairs(bool symmetric, const Quad<T>* field, Quad<T>* to) {
+  // Adds what the pairs have of the matrix, transposed or by its positive part, times a field.
+  void add_pairs(bool positive, const Quad<T>* field, Quad<T>* to) {
     pairs_->multiply(
-        symmetric, [&](int i) { return in_double(field[i]); },
+        positive, [&](int i) { return in_double(field[i]); },
         [&](int i, const Vec3<double>& a) {
           const Vec3<T> free = project(Vec3<T>{T(a.x), T(a.y), T(a.z)}, projector(i));
           to[i] = to[i] + Lanes::value(free);

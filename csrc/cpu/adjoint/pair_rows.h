@@ -23,7 +23,7 @@ namespace pd::inline PD_TARGET {
 
 // Square of the sine of the angle to other rows, below which a row counts as one of their span.
 template <class T>
-constexpr double repeated_row = sizeof(T) == 4 ? 1e-6 : 1e-10;
+constexpr double repeated_row = sizeof(T) == 4 ? 1e-6 : 1e-8;
 
 struct PairRow {
   int vertex[4];                    // -1: does not move
@@ -53,17 +53,10 @@ class PairRows {
     for (Patch& patch : patches_) factor(patch, tolerance);
   }
 
-  // `read(vertex)`: of the field; `add(vertex, change)`: to it
+  // `read(vertex)`: of the field; `add(vertex, change)`: to it. Twice, since rows that nearly repeat others cost digits.
   template <class Read, class Add>
   void project(const Read& read, const Add& add) {
-    for (const Patch& patch : patches_) {
-      sums_.clear();
-      for (int p : patch.pivots) sums_.push_back(weighted(rows_[patch.rows[p]], read));
-      solve(patch, sums_);
-      for (std::size_t j = 0; j < patch.pivots.size(); ++j)
-        each_held(rows_[patch.rows[patch.pivots[j]]],
-                  [&](int v, const Vec3<double>& c) { add(v, -sums_[j] * c); });
-    }
+    for (int round = 0; round < 2; ++round) project_once(read, add);
   }
 
   template <class Read, class Add>
@@ -244,6 +237,18 @@ class PairRows {
       }
     }
     decompose(patch.mixed, rank, patch.order);
+  }
+
+  template <class Read, class Add>
+  void project_once(const Read& read, const Add& add) {
+    for (const Patch& patch : patches_) {
+      sums_.clear();
+      for (int p : patch.pivots) sums_.push_back(weighted(rows_[patch.rows[p]], read));
+      solve(patch, sums_);
+      for (std::size_t j = 0; j < patch.pivots.size(); ++j)
+        each_held(rows_[patch.rows[patch.pivots[j]]],
+                  [&](int v, const Vec3<double>& c) { add(v, -sums_[j] * c); });
+    }
   }
 
   // sums <- (L_r L_r^T)^-1 sums

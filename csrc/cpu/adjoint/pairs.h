@@ -74,24 +74,29 @@ class AdjointPairs {
   const std::vector<Place>& end() const { return end_; }
   bool some() const { return !items_.empty(); }
 
-  // Visits visit(i, K^T l) for every vertex that moves, or (K + K^T) / 2 l; `read(i)`: l there.
+  // Visits visit(i, K^T l) for every vertex that moves; `read(i)`: l there. `positive`: the positive part alone, the turn
+  // of slips. Curvature of distances is negative where corners meet.
   template <class Read, class Visit>
-  void multiply(bool symmetric, const Read& read, const Visit& visit) {
+  void multiply(bool positive, const Read& read, const Visit& visit) {
     for (int i : touched_) sum_[i] = {0, 0, 0};
     for (const Item& item : items_) {
-      double l[12], product[12];
+      double l[12];
       gather(item, read, l);
-      const auto& load = item.slopes.load;
-      for (int j = 0; j < 12; ++j) {
-        double across = 0, along = 0;
-        for (int i = 0; i < 12; ++i) across += load[i][j] * l[i];
-        for (int i = 0; symmetric && i < 12; ++i) along += load[j][i] * l[i];
-        product[j] = symmetric ? 0.5 * (across + along) : across;
+      const auto& weight = item.pair.frame.weight;
+      double turned = 0;
+      for (int a = 0; positive && a < 4; ++a)
+        turned += weight[a] * dot(item.slopes.across, Place{l[3 * a], l[3 * a + 1], l[3 * a + 2]});
+      for (int a = 0; a < 4; ++a) {
+        const int v = item.inside[a];
+        if (v < 0) continue;
+        double product[3] = {0, 0, 0};
+        for (int j = 0; !positive && j < 3; ++j)
+          for (int i = 0; i < 12; ++i) product[j] += item.slopes.load[i][3 * a + j] * l[i];
+        const Place own = positive
+                              ? (item.slopes.stiffness * weight[a] * turned) * item.slopes.across
+                              : Place{product[0], product[1], product[2]};
+        sum_[v] = sum_[v] + own;
       }
-      for (int a = 0; a < 4; ++a)
-        if (item.inside[a] >= 0)
-          sum_[item.inside[a]] =
-              sum_[item.inside[a]] + Place{product[3 * a], product[3 * a + 1], product[3 * a + 2]};
     }
     for (int i : touched_) visit(i, sum_[i]);
   }
