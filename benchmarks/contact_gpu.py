@@ -58,7 +58,7 @@ def fold(cells: int) -> list[Any]:
     x = np.minimum(along, 0.0) + radius * np.sin(angle) - beyond
     places = np.stack([x, radius * (1.0 - np.cos(angle)) + 0.002, across], axis=1)
     sheet = pd.Cloth(pd.TriMesh(places, mesh.triangles), youngs=1e5, thickness=1e-3, area_density=0.2, bending=1e-6)
-    return [sheet, pd.Ground(friction=0.5), pd.Contact(thickness=min(1e-3, 0.3 / cells), friction=0.3)]
+    return [sheet, pd.Ground(friction=0.5), pd.Contact(thickness=min(1e-3, 0.1 / cells), friction=0.3)]
 
 
 SCENES: dict[str, tuple[Callable[[], list[Any]], tuple[int, ...]]] = {

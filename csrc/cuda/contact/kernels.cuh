@@ -142,7 +142,7 @@ PD_DEVICE void take_back(const ContactWork<T>& w, const ContactTeam& team, std::
 }
 
 template <ContactTask What, class T>
-__global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 2 : 1)
+__global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
     contact_task(const __grid_constant__ ContactKernel<T> call) {
   __shared__ ContactArrays<T> arrays;
   const int number = int(blockIdx.x) / call.blocks, thread = int(threadIdx.x);

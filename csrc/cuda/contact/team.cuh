@@ -4,7 +4,7 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int contact_threads = 256;
+constexpr int contact_threads = 128;
 constexpr int contact_chunk = 1024;  // items of a sum that one block adds up
 constexpr int most_contact_sums = 12;
 
@@ -23,6 +23,42 @@ class ContactTeam {
   template <class Item>
   PD_DEVICE void each(std::int64_t count, const Item& item) const {
     spread(count, item);
+    barrier();
+  }
+  // The lanes of a warp step through the tree together. What they find waits in a queue, until there is something to visit
+  // for every lane.
+  template <class Start, class Visit>
+  PD_DEVICE void walk(std::int64_t count, const Start& start, const Visit& visit) const {
+    const int lane = int(threadIdx.x) % warp_size;
+    int2* const queue = queue_of_warp();
+    std::int64_t base = team_.thread() - lane;
+    int queued = 0;
+    while (base < count || queued > 0) {
+      auto walk = start(int(min(base + lane, count - 1)));
+      bool walks = base + lane < count && !walk.ended;
+      base += team_.threads();
+      const bool last = base >= count;
+#pragma unroll 1
+      while (true) {
+        const int other = walks ? walk.step() : -1;
+        walks = walks && !walk.ended;
+        const unsigned found = __ballot_sync(full_warp, other >= 0);
+        if (other >= 0)
+          queue[queued + __popc(found & ((1u << lane) - 1))] = make_int2(walk.owner, other);
+        queued += __popc(found);
+        const bool active = __any_sync(full_warp, walks);
+        if (queued >= warp_size || (last && !active && queued > 0)) {
+          __syncwarp();
+          const int now = min(queued, warp_size);
+          if (lane < now) visit(queue[lane].x, queue[lane].y);
+          queued -= now;
+          __syncwarp();
+          if (lane < queued) queue[lane] = queue[warp_size + lane];
+          __syncwarp();
+        }
+        if (!active && (queued == 0 || !last)) break;
+      }
+    }
     barrier();
   }
   template <class Task>
@@ -115,6 +151,12 @@ class ContactTeam {
   PD_DEVICE bool leads() const { return threadIdx.x == 0; }
 
  private:
+  // One for all walks of a kernel.
+  PD_DEVICE static int2* queue_of_warp() {
+    __shared__ int2 queues[contact_threads / warp_size][2 * warp_size];
+    return queues[threadIdx.x / warp_size];
+  }
+
   template <int Count>
   PD_DEVICE static void block_sum(double (&value)[Count]) {
     block_reduce(value, Add{});

@@ -6,6 +6,7 @@
 //   spread(count, item)    a phase; each(count, item): and a barrier, after which all see what it wrote
 //   once(task)             one thread, and a barrier
 //   sum(count, add, sums)  sums of doubles in a fixed order, the same in all threads; scan(numbers, count): prefix sums
+//   walk(count, start, visit)  walks start(item) through a tree, and visit(owner, other) for what they find
 //   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own
 //
 // All threads of a team take the same branches: what they decide by is not written in the phase that follows.
@@ -29,7 +30,21 @@ struct ContactNumbers {
   int searched_at;
   int waits, checked;
   // of an iteration
-  int active, outside, loaded, cut, stopped, meets, changed;
+  int active, outside, loaded, cut, stopped, meets, changed, near;
+  int stuck;  // whether a pair of the list may be frozen
+};
+
+// Four numbers, for loads of 16 bytes.
+template <class T>
+struct alignas(4 * sizeof(T) > 16 ? 16 : 4 * sizeof(T)) Four {
+  T x, y, z, w;
+};
+
+// What a pair keeps over the sweeps of an iteration.
+template <class T>
+struct PairSweep {
+  T beta;
+  Vec3<T> before;  // sum w x_t
 };
 
 // Arrays of an environment. Vertices have the user's numbers, those of colliders last.
@@ -38,19 +53,24 @@ struct ContactArrays {
   Vec3<T>*begin, *place, *target, *goal, *shift, *checked, *end;  // [vertices] m
   Ball<T>* ball;                                                  // [vertices]
   T *inverse, *weight, *room;                                     // [vertices]
-  unsigned char *held, *cut, *surface;                            // [vertices]
-  int *start, *cursor;             // [vertices + 1]: entries of a vertex in the list of pairs
-  int* entry;                      // [4 capacity]: pair * 4 + corner, in the order of the pairs
-  ContactPair<T>* pair;            // [capacity] in the order of their keys
-  unsigned char* active;           // [capacity]
-  std::int64_t* known_key;         // [capacity] of the list before
-  Multiplier<T>* known_force;      // [capacity]
-  int *owner, *partner;            // [capacity] parts of a pair
-  int* owner_start;                // [owners + 1] pairs of each vertex, then of each edge
-  int* owner_near;                 // [owners]
-  Box<T>*triangle_box, *edge_box;  // of trees, all levels
-  RigidWay* rigid;                 // [bodies]
-  Box<T>* body_box;                // [bodies]
+  unsigned char *held, *cut, *surface, *touched;                  // [vertices]
+  // Entries of vertices: corners of their pairs, in the order of the pairs.
+  int *start, *cursor;  // [vertices + 1] first entry of each; counts
+  int *entry, *slot;    // [4 capacity] pair * 4 + corner in any order; the entry of each corner
+  Four<T>*push,
+      *space;  // [4 capacity] by entry: force of the pair and weight; normal and bound of a half-space
+  T* margin;                            // [4 capacity] of the half-space, or -1: its pair is frozen
+  PairSweep<T>* sweep;                  // [capacity]
+  ContactPair<T>* pair;                 // [capacity] in the order of their keys
+  unsigned char* active;                // [capacity]
+  std::int64_t* known_key;              // [capacity] of the list before
+  Multiplier<T>* known_force;           // [capacity]
+  int *owner, *partner;                 // [capacity] parts of a pair
+  int* owner_start;                     // [owners + 1] pairs of each vertex, then of each edge
+  int* owner_near;                      // [owners]
+  Box<T>*triangle_box, *edge_box;       // of trees, all levels
+  RigidWay* rigid;                      // [bodies]
+  Box<T>* body_box;                     // [bodies]
   T *together, *alone, *joint, *limit;  // [bodies] shares of ways
   int *body_begin, *body_end;           // [bodies] vertices
   int* group;                           // [bodies]
@@ -84,9 +104,13 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
     arena.place(*array, v);
   arena.place(a.ball, v);
   for (T** array : {&a.inverse, &a.weight, &a.room}) arena.place(*array, v);
-  for (unsigned char** array : {&a.held, &a.cut, &a.surface}) arena.place(*array, v);
+  for (unsigned char** array : {&a.held, &a.cut, &a.surface, &a.touched}) arena.place(*array, v);
   for (int** array : {&a.start, &a.cursor}) arena.place(*array, v + 1);
   arena.place(a.entry, 4 * m + 1);
+  arena.place(a.slot, 4 * m);
+  for (Four<T>** array : {&a.push, &a.space}) arena.place(*array, 4 * m);
+  arena.place(a.margin, 4 * m);
+  arena.place(a.sweep, m);
   arena.place(a.pair, m);
   arena.place(a.active, m);
   arena.place(a.known_key, m);
@@ -124,8 +148,8 @@ struct BodyState {
   int stride, vertices, components;
 
   PD_HD static Vec3<T> read(const T* of, int i) {
-    const T* p = of + 4 * std::int64_t(i);
-    return {p[0], p[1], p[2]};
+    const Four<T> f = reinterpret_cast<const Four<T>*>(of)[i];
+    return {f.x, f.y, f.z};
   }
   PD_HD static void write(T* to, int i, const Vec3<T>& value) {
     T* p = to + 4 * std::int64_t(i);
@@ -155,27 +179,50 @@ struct ContactEnvironment {
   PD_HD int owners() const { return plan.points + plan.edges; }
   PD_HD ContactNumbers& numbers() const { return *a.numbers; }
 
-  // calls visit(pair, corner) for the pairs of a vertex, in their order
-  template <class Visit>
-  PD_HD void each_of(int v, const Visit& visit) const {
-    for (int n = a.start[v]; n < a.start[v + 1]; ++n) visit(a.entry[n] / 4, a.entry[n] % 4);
-  }
   PD_HD bool is_stuck(int v) const {
     bool stuck = false;
-    each_of(v, [&](int p, int) { stuck = stuck || a.pair[p].plane.frozen; });
+    if (numbers().stuck) {
+      for (int n = a.start[v]; n < a.start[v + 1]; ++n) stuck = stuck || a.margin[n] < T(0);
+    }
     return stuck;
+  }
+  // The half-spaces of the corners of a pair.
+  PD_HD void keep_spaces(int p) const {
+    const ContactPair<T>& pair = a.pair[p];
+    if (pair.plane.frozen) numbers().stuck = 1;
+    for (int corner = 0; corner < 4; ++corner) {
+      const int n = a.slot[4 * p + corner];
+      visit_space(pair.plane, pair.on_a(corner), [&](const Vec3<T>& normal, T bound, T margin) {
+        a.space[n] = {normal.x, normal.y, normal.z, bound};
+        a.margin[n] = pair.plane.frozen ? T(-1) : margin;
+      });
+    }
+  }
+  // The force of a pair, by entries; zeros where it does not count.
+  PD_HD void keep_pushes(int p, bool counts) const {
+    const ContactPair<T>& pair = a.pair[p];
+    const Vec3<T> force = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
+    for (int corner = 0; corner < 4; ++corner) {
+      Four<T> push = {T(0), T(0), T(0), T(0)};
+      if (counts) push = {force.x, force.y, force.z, pair.near.weight[corner]};
+      a.push[a.slot[4 * p + corner]] = push;
+    }
   }
   // calls visit(normal, bound) for the planes and spheres of the scene
   template <class Visit>
   PD_HD void each_wall(int v, const Vec3<T>& place, const Visit& visit) const {
-    if (!walls.exist() || v >= plan.body_vertices || held(v)) return;
+    if (v >= plan.body_vertices || held(v)) return;
     pd::each_wall(walls, place, visit);
   }
   // calls visit(normal, bound, margin) for all half-spaces of a vertex
   template <class Visit>
   PD_HD void each_space(int v, const Visit& visit) const {
-    each_of(
-        v, [&](int p, int corner) { visit_space(a.pair[p].plane, a.pair[p].on_a(corner), visit); });
+    PD_UNROLL_4
+    for (int n = a.start[v]; n < a.start[v + 1]; ++n) {
+      const Four<T> space = a.space[n];
+      visit(Vec3<T>{space.x, space.y, space.z}, space.w, a.margin[n]);
+    }
+    if (!walls.exist()) return;
     const T here = place_rounding(a.place[v]), there = place_rounding(a.target[v]),
             margin = here < there ? there : here;
     each_wall(v, a.place[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });

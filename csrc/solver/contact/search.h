@@ -11,32 +11,6 @@ struct TreeOfBoxes {
   Box<T>* box;
   int count;
 
-  // calls visit(number) for leaves whose boxes meet `of`
-  template <class Visit>
-  PD_HD void each_near(const Box<T>& of, const Visit& visit) const {
-    if (count == 0) return;
-    int top = 0, first = 0;  // number of the first node of a level
-    for (; nodes(top) > 1; ++top) first += nodes(top);
-    int level = top, n = 0;
-    while (true) {
-      if (box[first + n].meets(of)) {
-        if (level > 0) {
-          --level;
-          first -= nodes(level);
-          n *= tree_fan;
-          continue;
-        }
-        visit(order[n]);
-      }
-      ++n;
-      while (level < top && (n % tree_fan == 0 || n >= nodes(level))) {
-        n = (n - 1) / tree_fan + 1;
-        first += nodes(level);
-        ++level;
-      }
-      if (level == top && n >= 1) return;
-    }
-  }
   PD_HD int nodes(int level) const { return ((count - 1) >> (5 * level)) + 1; }
 
   // boxes of a level from those below
@@ -54,6 +28,55 @@ struct TreeOfBoxes {
       below = own;
       n = nodes;
     }
+  }
+};
+
+// A part of a surface on its way through a tree, node by node.
+template <class T>
+struct TreeWalk {
+  const ContactPlan<T>& plan;
+  const TreeOfBoxes<T>* tree;
+  Box<T> box;
+  int owner, least;  // numbers of other parts must be larger
+  int vertex[2];     // of the part
+  int top, level, first, n;
+  bool ended;
+
+  // Tests the next node; returns the number of a leaf whose box meets that of the part, or -1.
+  PD_HD int step() {
+    if (tree->box[first + n].meets(box)) {
+      if (level > 0) {
+        --level;
+        first -= tree->nodes(level);
+        n *= tree_fan;
+        return -1;
+      }
+      const int other = tree->order[n];
+      advance();
+      return other > least && is_apart(other) ? other : -1;
+    }
+    advance();
+    return -1;
+  }
+
+ private:
+  PD_HD void advance() {
+    ++n;
+    while (level < top && (n % tree_fan == 0 || n >= tree->nodes(level))) {
+      n = (n - 1) / tree_fan + 1;
+      first += tree->nodes(level);
+      ++level;
+    }
+    ended = level == top && n >= 1;
+  }
+  // Whether the other part has no vertex of this one.
+  PD_HD bool is_apart(int other) const {
+    const bool point = owner < plan.points;
+    const int count = point ? 3 : 2;
+    const int* of = point ? plan.triangle + 3 * other : plan.edge + 2 * other;
+    bool apart = true;
+    for (int c = 0; c < count; ++c) apart = apart && of[c] != vertex[0] && of[c] != vertex[1];
+    return apart;
   }
 };
 
@@ -86,19 +109,35 @@ class ContactSearch {
   PD_HD void each_boxed(const Team& team, const BoxOf& box_of, const Reach& reach,
                         const Wants& wants, const Visit& visit) const {
     const ContactPlan<T>& plan = env_.plan;
-    team.each(env_.owners(), [&](int item) {
-      const bool point = item < plan.points;
-      const int own = point ? plan.point_order[item] : plan.edge_order[item - plan.points],
-                owner = point ? own : plan.points + own;
-      if (!wants(owner)) return;
-      const int* vertex = point ? plan.point + own : plan.edge + 2 * own;
-      const Box<T> box = side(vertex, point ? 1 : 2, box_of, reach);
-      (point ? triangles_ : edges_).each_near(box, [&](int other) {
-        if (!point && other <= own) return;
-        ContactPair<T> pair = pair_of(owner, other);
-        if (complete(plan, [&](int v) { return env_.held(v); }, pair)) visit(owner, other, pair);
-      });
-    });
+    team.walk(
+        env_.owners(),
+        [&](int item) {
+          const bool point = item < plan.points;
+          const int own = point ? plan.point_order[item] : plan.edge_order[item - plan.points];
+          const int* const vertex = point ? plan.point + own : plan.edge + 2 * own;
+          const TreeOfBoxes<T>& tree = point ? triangles_ : edges_;
+          TreeWalk<T> walk{plan,
+                           &tree,
+                           {},
+                           point ? own : plan.points + own,
+                           point ? -1 : own,
+                           {vertex[0], vertex[point ? 0 : 1]},
+                           0,
+                           0,
+                           0,
+                           0,
+                           false};
+          walk.ended = tree.count == 0 || !wants(walk.owner);
+          if (walk.ended) return walk;
+          walk.box = side(vertex, point ? 1 : 2, box_of, reach);
+          for (; tree.nodes(walk.top) > 1; ++walk.top) walk.first += tree.nodes(walk.top);
+          walk.level = walk.top;
+          return walk;
+        },
+        [&](int owner, int other) {
+          ContactPair<T> pair = pair_of(owner, other);
+          if (complete(plan, [&](int v) { return env_.held(v); }, pair)) visit(owner, other, pair);
+        });
   }
 
   PD_HD ContactPair<T> pair_of(int owner, int other) const {
@@ -125,6 +164,7 @@ class ContactSearch {
     });
     team.spread(plan.vertices, [&](int v) { a.room[v] = T(HUGE_VAL), a.cursor[v] = 0; });
     team.spread(env_.owners(), [&](int n) { a.owner_near[n] = 0, a.owner_start[n] = 0; });
+    team.spread(1, [&](int) { numbers.near = numbers.stuck = 0; });
     refit(team, box_of, reach);
     each_boxed(
         team, box_of, reach, [](int) { return true; },
@@ -132,7 +172,7 @@ class ContactSearch {
           measure(pair);
           if (!pair.is_within(most, plan.thickness)) return;
           for (int v : pair.vertex) lower(a.room + v, pair.near.distance);
-          a.owner_near[owner] = 1;
+          a.owner_near[owner] = numbers.near = 1;
         });
     team.each(plan.vertices, [&](int v) {
       const Vec3<T> way = a.target[v] - a.place[v];
@@ -145,17 +185,20 @@ class ContactSearch {
       a.ball[v].radius = a.surface[v] ? (bound < larger ? bound : larger) : T(HUGE_VAL);
     });
     const auto radius = [&](int v) { return a.ball[v].radius; };
-    const auto each_listed = [&](const auto& visit) {
-      each_boxed(
-          team, box_of, reach, [&](int owner) { return a.owner_near[owner] != 0; },
-          [&](int owner, int other, ContactPair<T>& pair) {
-            measure(pair);
-            if (pair.is_within(radius, plan.thickness)) visit(owner, other);
-          });
+    const auto each_listed = [&](const auto& wants, const auto& visit) {
+      each_boxed(team, box_of, reach, wants, [&](int owner, int other, ContactPair<T>& pair) {
+        measure(pair);
+        if (pair.is_within(radius, plan.thickness)) visit(owner, other);
+      });
     };
-    each_listed([&](int owner, int) { ++a.owner_start[owner]; });
-    team.scan(a.owner_start, env_.owners());
-    const int found = a.owner_start[env_.owners()], count = found > plan.capacity ? 0 : found;
+    int found = 0;
+    if (numbers.near) {
+      each_listed([&](int owner) { return a.owner_near[owner] != 0; },
+                  [&](int owner, int) { count_one(a.owner_start + owner); });
+      team.scan(a.owner_start, env_.owners());
+      found = a.owner_start[env_.owners()];
+    }
+    const int count = found > plan.capacity ? 0 : found;
     team.once([&] {
       numbers.pairs = count;
       numbers.most_pairs = found > numbers.most_pairs ? found : numbers.most_pairs;
@@ -163,15 +206,17 @@ class ContactSearch {
     });
     if (count > 0) {
       team.each(env_.owners(), [&](int n) { a.owner_near[n] = 0; });
-      each_boxed(
-          team, box_of, reach,
-          [&](int owner) { return a.owner_start[owner] < a.owner_start[owner + 1]; },
-          [&](int owner, int other, ContactPair<T>& pair) {
-            measure(pair);
-            if (!pair.is_within(radius, plan.thickness)) return;
-            place_in_order(a.partner + a.owner_start[owner], a.owner_near[owner], other);
-            a.owner[a.owner_start[owner] + a.owner_near[owner]++] = owner;
-          });
+      each_listed([&](int owner) { return a.owner_start[owner] < a.owner_start[owner + 1]; },
+                  [&](int owner, int other) {
+                    const int at = a.owner_start[owner] + count_one(a.owner_near + owner);
+                    a.partner[at] = other;
+                    a.owner[at] = owner;
+                  });
+      team.each(env_.owners(), [&](int n) {
+        int* const partner = a.partner + a.owner_start[n];
+        const int own = a.owner_start[n + 1] - a.owner_start[n];
+        for (int k = 1; k < own; ++k) place_in_order(partner, k, partner[k]);
+      });
     }
     team.each(count, [&](int p) {
       ContactPair<T>& pair = a.pair[p];
@@ -224,23 +269,27 @@ class ContactSearch {
     return {f[0], {f[1], f[2], f[3]}};
   }
 
-  // Entries of every vertex in the order of the pairs. `cursor`: their numbers
+  // Entries of every vertex in the order of the pairs: each finds its place among those of its vertex. `cursor`: their numbers
   template <class Team>
   PD_HD void index(const Team& team, int count) const {
     const ContactArrays<T>& a = env_.a;
     const int vertices = env_.plan.vertices;
     team.each(vertices, [&](int v) { a.start[v] = a.cursor[v], a.cursor[v] = 0; });
     team.scan(a.start, vertices);
-    if (count == 0) return;
-    team.each(count, [&](int p) {
-      for (int corner = 0; corner < 4; ++corner) {
-        const int v = a.pair[p].vertex[corner];
-        a.entry[a.start[v] + count_one(a.cursor + v)] = 4 * p + corner;
-      }
+    team.each(4 * std::int64_t(count), [&](int e) {
+      const int v = a.pair[e / 4].vertex[e % 4];
+      a.entry[a.start[v] + count_one(a.cursor + v)] = e;
     });
-    team.each(vertices, [&](int v) {
-      int* const entry = a.entry + a.start[v];
-      for (int n = 1; n < a.start[v + 1] - a.start[v]; ++n) place_in_order(entry, n, entry[n]);
+    team.each(4 * std::int64_t(count), [&](int e) {
+      const int v = a.pair[e / 4].vertex[e % 4], begin = a.start[v];
+      int rank = 0;
+      for (int n = begin; n < a.start[v + 1]; ++n) rank += a.entry[n] < e;
+      a.slot[e] = begin + rank;
+    });
+    team.each(count, [&](int p) {
+      a.active[p] = 0;
+      env_.keep_spaces(p);
+      env_.keep_pushes(p, false);
     });
   }
 

@@ -14,6 +14,16 @@ class SerialTeam {
   void each(std::int64_t count, const Item& item) const {
     spread(count, item);
   }
+  template <class Start, class Visit>
+  void walk(std::int64_t count, const Start& start, const Visit& visit) const {
+    for (std::int64_t i = 0; i < count; ++i) {
+      auto walk = start(int(i));
+      while (!walk.ended) {
+        const int other = walk.step();
+        if (other >= 0) visit(walk.owner, other);
+      }
+    }
+  }
   template <class Task>
   void once(const Task& task) const {
     task();

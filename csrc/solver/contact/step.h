@@ -100,7 +100,7 @@ class ContactSteps {
       });
     });
     want(team, body_.u);
-    watch(team, pairs);
+    watch(team, pairs, false);
     prepare(team, iterations);
     double none[2];
     go(team, false, none);
@@ -120,24 +120,25 @@ class ContactSteps {
   template <class Team>
   PD_HD Merits iterate(const Team& team, int k, const Iteration& of, double (&sums)[2]) const {
     const int pairs = env_.numbers().pairs;
-    team.spread(pairs, [&](int p) {
-      ContactPair<T>& pair = a_.pair[p];
-      look(pair);
-    });
-    want(team, body_.free);
     Merits merits{};
-    if (of.guards) merits = check(team, pairs, of.energy);
-    if (pairs > 0) prox(team, pairs, of.c);
-    if (env_.walls.exist()) {
+    if (pairs == 0 && !of.guards) {
+      team.spread(1, [&](int) { env_.numbers().cut = 0; });
       team.spread(body_.vertices, [&](int i) {
-        Vec3<T>& target = a_.target[body_.order[i]];
-        const Vec3<T> u = target - BodyState<T>::read(body_.x, i);
-        target =
-            body_.place(i, body_.vertex(i).project(env_.walls, u, BodyState<T>::read(body_.u, i)));
+        want_vertex(i, body_.free);
+        leave_walls(i);
+        watch_vertex(body_.order[i]);
       });
-      team.barrier();
+      team.each(plan_.vertices - plan_.body_vertices, [&](int n) {
+        a_.target[plan_.body_vertices + n] = a_.goal[plan_.body_vertices + n];
+        watch_vertex(plan_.body_vertices + n);
+      });
+    } else {
+      team.spread(pairs, [&](int p) { look(a_.pair[p]); });
+      want(team, body_.free);
+      if (of.guards) merits = check(team, pairs, of.energy);
+      if (pairs > 0) prox(team, pairs, of.c);
+      watch(team, pairs, true);
     }
-    watch(team, pairs);
     prepare(team, k);
     go(team, of.measures, sums);
     return merits;
@@ -156,14 +157,14 @@ class ContactSteps {
       ContactPair<T>& pair = a_.pair[p];
       look(pair);
       lower(a_.most + plan_.colliders + 1, pair.near.distance / pair.thickness);
+      env_.keep_pushes(p, true);
     });
     team.each(plan_.vertices, [&](int v) {
       Vec3<T> force = {T(0), T(0), T(0)};
-      env_.each_of(v, [&](int p, int corner) {
-        const ContactPair<T>& pair = a_.pair[p];
-        const Vec3<T> each = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
-        force = multiply_add(pair.near.weight[corner], each, force);
-      });
+      for (int n = a_.start[v]; n < a_.start[v + 1]; ++n) {
+        const Four<T> push = a_.push[n];
+        force = multiply_add(push.w, Vec3<T>{push.x, push.y, push.z}, force);
+      }
       T* const to = forces + 3 * std::int64_t(v);
       to[0] = force.x, to[1] = force.y, to[2] = force.z;
       if (!env_.held(v)) return;
@@ -247,22 +248,27 @@ class ContactSteps {
     });
   }
 
-  // Targets of the next move: displacements of bodies, and the goals of what moves by hand. What iterations count begins.
+  // Targets of the next move: displacements of bodies, and the goals of what moves by hand.
+  PD_HD void want_vertex(int i, const T* displacement) const {
+    const int v = body_.order[i];
+    a_.target[v] = env_.held(v) ? a_.goal[v] : body_.place(i, BodyState<T>::read(displacement, i));
+  }
   template <class Team>
   PD_HD void want(const Team& team, const T* displacement) const {
-    team.spread(body_.vertices, [&](int i) {
-      const int v = body_.order[i];
-      a_.target[v] =
-          env_.held(v) ? a_.goal[v] : body_.place(i, BodyState<T>::read(displacement, i));
+    team.spread(1, [&](int) { env_.numbers().cut = 0; });
+    team.spread(plan_.vertices, [&](int v) { a_.touched[v] = 0; });
+    team.spread(body_.vertices, [&](int i) { want_vertex(i, displacement); });
+    team.each(plan_.vertices - plan_.body_vertices, [&](int n) {
+      a_.target[plan_.body_vertices + n] = a_.goal[plan_.body_vertices + n];
     });
-    team.spread(plan_.vertices - plan_.body_vertices, [&](int n) {
-      const int v = plan_.body_vertices + n;
-      a_.target[v] = a_.goal[v];
-    });
-    team.once([&] {
-      ContactNumbers& numbers = env_.numbers();
-      numbers.active = numbers.outside = numbers.loaded = numbers.cut = 0;
-    });
+  }
+
+  // A target out of the planes and spheres of the scene, with their friction.
+  PD_HD void leave_walls(int i) const {
+    if (!env_.walls.exist()) return;
+    Vec3<T>& target = a_.target[body_.order[i]];
+    const Vec3<T> u = target - BodyState<T>::read(body_.x, i);
+    target = body_.place(i, body_.vertex(i).project(env_.walls, u, BodyState<T>::read(body_.u, i)));
   }
 
   // Closest points and normal at the present iterate.
@@ -308,17 +314,20 @@ class ContactSteps {
     ContactNumbers& numbers = env_.numbers();
     team.each(pairs, [&](int p) {
       ContactPair<T>& pair = a_.pair[p];
-      a_.active[p] = 0;
-      if (!(pair.freedom(a_.inverse) > T(least_yield))) {
+      bool active = false;
+      if (pair.freedom(a_.inverse) > T(least_yield)) {
+        Vec3<T> corner[4];
+        pair.corners(a_.target, corner);
+        const bool touches = dot(pair.normal, combined(pair.near.weight, corner)) < pair.thickness;
+        active = touches || pair.force.normal > T(0);
+      } else {
         pair.force = {};  // nothing can yield
-        return;
       }
-      Vec3<T> corner[4];
-      pair.corners(a_.target, corner);
-      const bool touches = dot(pair.normal, combined(pair.near.weight, corner)) < pair.thickness;
-      if (!touches && !(pair.force.normal > T(0))) return;
-      a_.active[p] = 1;
+      if (active || a_.active[p]) env_.keep_pushes(p, active);
+      a_.active[p] = active;
+      if (!active) return;
       numbers.active = 1;
+      for (int v : pair.vertex) a_.touched[v] = 1;
     });
     if (!numbers.active) return;
     push(team, c, true, false);
@@ -326,13 +335,18 @@ class ContactSteps {
       team.each(pairs, [&](int p) {
         if (!a_.active[p]) return;
         ContactPair<T>& pair = a_.pair[p];
-        Vec3<T> between[4], before[4];
+        if (sweep == 0) {
+          Vec3<T> before[4];
+          pair.corners(a_.begin, before);
+          a_.sweep[p] = {T(1) / (c * row_bound(pair, a_.weight, a_.inverse)),
+                         combined(pair.near.weight, before)};
+        }
+        Vec3<T> between[4];
         pair.corners(a_.shift, between);
-        pair.corners(a_.begin, before);
-        const T beta = T(1) / (c * row_bound(pair, a_.weight, a_.inverse));
-        pair.force =
-            advance(pair.force, beta, pair.thickness, pair.friction, pair.normal,
-                    combined(pair.near.weight, between), combined(pair.near.weight, before));
+        const PairSweep<T> of = a_.sweep[p];
+        pair.force = advance(pair.force, of.beta, pair.thickness, pair.friction, pair.normal,
+                             combined(pair.near.weight, between), of.before);
+        env_.keep_pushes(p, true);
       });
       push(team, c, false, sweep + 1 == contact_sweeps);
     }
@@ -342,36 +356,41 @@ class ContactSteps {
   template <class Team>
   PD_HD void push(const Team& team, T c, bool first, bool last) const {
     team.each(plan_.vertices, [&](int v) {
-      if (a_.start[v] == a_.start[v + 1]) return;
+      if (!a_.touched[v]) return;
+      const int begin = a_.start[v], end = a_.start[v + 1];
       Vec3<T> shift = a_.target[v];
+      const T inverse = a_.inverse[v];
       T weight(0);
-      bool touched = false;
-      env_.each_of(v, [&](int p, int corner) {
-        if (!a_.active[p]) return;
-        const ContactPair<T>& pair = a_.pair[p];
-        const Vec3<T> force = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
-        weight = weight + absolute(pair.near.weight[corner]);
-        shift = multiply_add(c * pair.near.weight[corner] * a_.inverse[v], force, shift);
-        touched = true;
-      });
+      PD_UNROLL_4
+      for (int n = begin; n < end; ++n) {
+        const Four<T> of = a_.push[n];
+        weight = weight + absolute(of.w);
+        shift = multiply_add(c * of.w * inverse, Vec3<T>{of.x, of.y, of.z}, shift);
+      }
       a_.shift[v] = shift;
       if (first) a_.weight[v] = weight;
-      if (last && touched) a_.target[v] = shift;
+      if (last) a_.target[v] = shift;
     });
   }
 
-  // Finds whether a vertex wants to leave its ball, and whether a pair has a force.
+  // Finds whether a vertex wants to leave its ball, and whether a pair has a force. `walls`: targets leave them first
+  PD_HD void watch_vertex(int v) const {
+    Vec3<T> target = a_.target[v];
+    if (move_into(a_.ball[v], target)) env_.numbers().outside = 1;
+    a_.cut[v] = 0;
+  }
   template <class Team>
-  PD_HD void watch(const Team& team, int pairs) const {
+  PD_HD void watch(const Team& team, int pairs, bool walls) const {
     ContactNumbers& numbers = env_.numbers();
     team.spread(pairs, [&](int p) {
       if (a_.pair[p].force.normal != T(0)) numbers.loaded = 1;
     });
-    team.each(plan_.vertices, [&](int v) {
-      Vec3<T> target = a_.target[v];
-      if (move_into(a_.ball[v], target)) numbers.outside = 1;
-      a_.cut[v] = 0;
+    team.spread(body_.vertices, [&](int i) {
+      if (walls) leave_walls(i);
+      watch_vertex(body_.order[i]);
     });
+    team.each(plan_.vertices - plan_.body_vertices,
+              [&](int n) { watch_vertex(plan_.body_vertices + n); });
   }
 
   // Before the move of iteration k: a search if a vertex wants to leave its ball, else planes that targets violate are made
@@ -390,8 +409,9 @@ class ContactSteps {
     team.spread(1, [&](int) { numbers.waits = outside; });
     team.each(pairs, [&](int p) {
       ContactPair<T>& pair = a_.pair[p];
-      if (breaks(pair, a_.target))
-        make_plane(pair, a_.place, a_.target, pair.near, pair.plane.normal);
+      if (!breaks(pair, a_.target)) return;
+      make_plane(pair, a_.place, a_.target, pair.near, pair.plane.normal);
+      env_.keep_spaces(p);
     });
   }
 
@@ -421,6 +441,11 @@ class ContactSteps {
       sum[1] += double(dot(off, off));
     };
     sums[0] = sums[1] = 0;
+    // all have decided by them
+    team.spread(1, [&](int) {
+      ContactNumbers& numbers = env_.numbers();
+      numbers.active = numbers.outside = numbers.loaded = 0;
+    });
     if (measures) {
       team.sum(body_.vertices, move, sums);
     } else {

@@ -184,6 +184,14 @@ def plates(to: float, seconds: float = 0.2) -> tuple[Course, pd.Collider, pd.Col
     return Course(scene, targets=targets), upper, lower
 
 
+def two_sheets(cells: int) -> Course:
+    """A level cloth of .4 m falls on another one, which is pinned, by a tenth of a millimetre."""
+    lower, upper = (cloth(plane(0.4, 0.4, cells).translated((0.0, height, 0.0))) for height in (0.0, 0.0011))
+    pin = pd.Pin(lower, np.ones(len(lower.mesh.vertices), dtype=bool))
+    scene = pd.Scene(lower, upper, pin, gravity(), pd.Contact(thickness=THICKNESS))
+    return Course(scene, each(scene, (0.0, 0.0, 0.0), (0.0, -0.01, 0.0)))
+
+
 def folded_sheet(*, self_contact: bool, cells: int = 12) -> Course:
     """A cloth of .4 m on the ground, curled over so that its upper part falls on the lower at 2 m/s."""
     radius, flat = 0.03, 0.15
