@@ -18,7 +18,7 @@ from .state import ContactHistory, HistoryState, State
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_GAP, _MISSING, _PINS_HELD_BACK, _UNBALANCED = 0, 1, 6, 7  # columns in csrc/cpu/contact/views.h
+_MISSING, _PINS_HELD_BACK, _UNBALANCED = 1, 2, 3  # columns in csrc/cpu/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 
 
@@ -89,10 +89,12 @@ class BodyContact:
             (after,) = _ops.next_history(positions, material, plan, time_step=settings["time_step"])
             # the step of an environment whose pairs exceed the capacity is taken back
             flow = torch.where((numbers[:, _MISSING] > 0)[:, None, None], flow, after)
-        held_back = torch.cat([numbers[:, _PINS_HELD_BACK, None], held.double()], dim=1).amax(dim=1)
-        own = torch.stack([numbers[:, _GAP], numbers[:, _MISSING], held_back], dim=1)
+        held_back = numbers[:, _PINS_HELD_BACK:_UNBALANCED]
+        if held.shape[1]:
+            held_back = torch.cat([held_back, held.double()], dim=1).amax(dim=1, keepdim=True)
         # the residual of other scenes would count forces between bodies as unbalanced
-        rows = torch.cat([numbers[:, _UNBALANCED, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
+        unbalanced, gaps = numbers[:, _UNBALANCED : _UNBALANCED + 1], numbers[:, :_PINS_HELD_BACK]
+        rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back], dim=1)
         return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
 
     @staticmethod
@@ -137,7 +139,8 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype) -> list[Tensor]:
     sizes = [len(plan.self_contact), len(plan.poses), plan.capacity]
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     trees = [plan.vertex_tree.order, plan.triangle_tree.order, plan.edge_tree.order]
-    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction, [plan.thickness]]
+    rest = [plan.near.thickness, plan.shape, plan.apart]
+    reals = [*rest, plan.points.reshape(-1, 3), plan.cell, plan.friction, [plan.thickness]]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     return [*map(whole, [sizes, *surfaces, *trees]), keys, *map(real, reals)]
 

@@ -41,7 +41,7 @@ Array = NDArray[np.float64]
 
 CHECK = 4  # iterations between checks of the guard
 PAUSE = 5  # least iterations between searches: a guard that every search blinds would never see a rise
-SWEEPS = 4
+SWEEPS = 8  # with 4 an edge that lies on an edge cycles
 
 
 @dataclass(frozen=True)
