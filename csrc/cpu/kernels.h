@@ -109,6 +109,10 @@ void step_any(const StepCall<T>& call, int threads) {
   has_contacts ? step_with<true>(call, threads) : step_with<false>(call, threads);
 }
 
+// contact/kernels.h calls it, too
+template void step_any(const StepCall<float>&, int);
+template void step_any(const StepCall<double>&, int);
+
 // In a translation unit of its own: cpu/contact/kernels.h.
 template <class T>
 void contact_step_any(const StepCall<T>& call, const ContactCall<T>& contact, int threads);

@@ -20,7 +20,7 @@ from .state import ContactHistory, HistoryState, State
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_GAP, _MISSING, _PINS_HELD_BACK, _UNBALANCED = 0, 1, 6, 7  # columns in csrc/contact/views.h
+_MISSING, _PINS_HELD_BACK, _UNBALANCED = 1, 2, 3  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 
 
@@ -116,17 +116,19 @@ class BodyContact:
             (after,) = _ops.next_history(positions, material, plan, time_step=settings["time_step"])
             # the step of an environment whose pairs exceed the capacity is taken back
             flow = torch.where((numbers[:, _MISSING] > 0)[:, None, None], flow, after)
-        held_back = torch.cat([numbers[:, _PINS_HELD_BACK, None], held.double()], dim=1).amax(dim=1)
-        own = torch.stack([numbers[:, _GAP], numbers[:, _MISSING], held_back], dim=1)
+        held_back = numbers[:, _PINS_HELD_BACK:_UNBALANCED]
+        if held.shape[1]:
+            held_back = torch.cat([held_back, held.double()], dim=1).amax(dim=1, keepdim=True)
         # the residual of other scenes would count forces between bodies as unbalanced
-        rows = torch.cat([numbers[:, _UNBALANCED, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
+        unbalanced, gaps = numbers[:, _UNBALANCED : _UNBALANCED + 1], numbers[:, :_PINS_HELD_BACK]
+        rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back], dim=1)
         return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
 
     @property
     def surfaces(self) -> ContactSurfaces:
         """What forces between surfaces are read by."""
         triangles, edges, _, body, collider = self.arrays[1:6]
-        points, cell, _, thickness = self.arrays[12:]
+        points, cell, _, thickness = self.arrays[14:]
         return ContactSurfaces(triangles, edges, body, collider, points, cell, thickness.to(points.device))
 
     @staticmethod
@@ -171,7 +173,8 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     sizes = whole([len(plan.self_contact), len(plan.poses), plan.capacity])
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     trees = [plan.vertex_tree.order, plan.triangle_tree.order, plan.edge_tree.order]
-    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction]
+    rest = [plan.near.thickness, plan.shape, plan.apart]
+    reals = [*rest, plan.points.reshape(-1, 3), plan.cell, plan.friction]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     moved = [array.to(device) for array in (*map(whole, [*surfaces, *trees]), keys, *map(real, reals))]
     return [sizes, *moved, real([plan.thickness])]

@@ -161,7 +161,7 @@ class Notices:
         if scene is None:
             return
         missing = rows[:, _MISSING]
-        if bool((missing > 0.0).any()):
+        if bool(missing.any()):
             self._said.add("capacity")
             worst, capacity = int(missing.argmax()), owner.body_contact.plan.capacity  # type: ignore[attr-defined]
             need = capacity + int(missing[worst])

@@ -27,6 +27,12 @@ struct Hand {
   Pose<T> pose, goal;  // the actual one, and that of the step's end
   int begin, end;      // vertices
 
+  PD_HD bool is_there() const {
+    const Vec3<T> way = goal.origin - pose.origin, turn = goal.axis - pose.axis;
+    return way.x == T(0) && way.y == T(0) && way.z == T(0) && turn.x == T(0) && turn.y == T(0) &&
+           turn.z == T(0) && goal.w == pose.w;
+  }
+
   PD_HD static Pose<T> read(const T* p) { return {{p[0], p[1], p[2]}, p[3], {p[4], p[5], p[6]}}; }
   PD_HD static void write(const Pose<T>& pose, T* p) {
     p[0] = pose.origin.x, p[1] = pose.origin.y, p[2] = pose.origin.z, p[3] = pose.w;

@@ -30,12 +30,20 @@ class CoarseContact {
         component_(contact.vertices, -1),
         members_(plan.components),
         local_(plan.components),
-        motion_(plan.components) {
+        motion_(plan.components),
+        several_(contact.bodies, 0) {
     for (int i = 0; i < plan.vertices; ++i) {
       const int g = plan.vertex_component[i];
       inside_[plan.vertex_order[i]] = i;
       component_[plan.vertex_order[i]] = g;
       if (g >= 0) members_[g].push_back(i);
+    }
+    std::vector<int> first(contact.bodies, -1);
+    for (int v = 0; v < contact.body_vertices; ++v) {
+      int& of = first[contact.body[v]];
+      if (of < 0) of = v;
+      if (component_[v] != component_[of])
+        several_[contact.body[v]] = contact.touches_itself[contact.body[v]] != 0;
     }
   }
 
@@ -244,9 +252,12 @@ class CoarseContact {
         return T(turn_bow * length(motion_[component_[v]].turn * (wide(places[v]) - motion.center))) +
                T(0.5) * contact_.thickness;
       };
-      run.search().each_boxed(
-          swept, reach, [&](int v) { return run.moves_by_hand(v); },
-          [&](const ContactPair<T>& pair) { consider(pair); });
+      run.near().each_meeting(
+          swept, reach, [&](int b) { return several_[b] != 0; }, [](int, int) { return true; },
+          [&](const PairSides& sides) {
+            const T thickness = run.near().search().thickness_of(sides);
+            if (thickness > T(0)) consider(run.near().search().pair_of(sides, thickness));
+          });
     }
     kept_.clear();
     for (const ContactPair<T>& pair : across_) {
@@ -279,6 +290,7 @@ class CoarseContact {
   std::vector<char> moves_;
   std::vector<ContactPair<T>> across_;
   std::vector<Kept<T>> kept_;
+  std::vector<char> several_;  // of bodies that touch themselves: whether they have several components
   bool swept_ = false;
 };
 

@@ -75,9 +75,10 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     const T omega(next_omega_[0]);
     const bool guards = schedule_[0].checks_energy(k);
     run_.look();
-    sweep_.run(k & 1, elastic_gradient<true>(), [&](std::int64_t i, const Value& force, Sum& sums) {
+    const auto gradient = elastic_gradient<true>(guards);
+    sweep_.run(k & 1, gradient, [&](std::int64_t i, const Value& force, Sum& sums) {
       const auto v = vertex(i);
-      sums.energy = v.add_energy(w_.u[i], sums.energy);
+      if (guards) sums.energy = v.add_energy(w_.u[i], sums.energy);
       free_[i] = Lanes::vec3(accelerate(w_.u[i], w_.before[i], v.gradient(w_.u[i], force),
                                         theta_ * w_.inverse[i], omega));
     });

@@ -45,7 +45,7 @@ Array = NDArray[np.float64]
 
 CHECK = 4  # iterations between checks of the guard
 PAUSE = 5  # least iterations between searches: a guard that every search blinds would never see a rise
-SWEEPS = 4
+SWEEPS = 8  # with 4 an edge that lies on an edge cycles
 PASSES = 64  # of a coarse correction; most of them take 5 to 30
 TRIALS = 4  # of a coarse correction whose motions are cut
 EVERY = 8  # iterations between coarse corrections
