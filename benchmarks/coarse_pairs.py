@@ -94,6 +94,7 @@ class Bodies:
         return PairContacts(
             np.array(vertices, np.int64).reshape(count, 4), np.array(weights).reshape(count, 4),
             np.array(normals).reshape(count, 3), np.array(offsets), np.full(count, self.friction), np.zeros((count, 3)),
+            np.zeros((count, 3)),
         )  # fmt: skip
 
 

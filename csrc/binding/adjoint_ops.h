@@ -177,6 +177,7 @@ std::tuple<Tensor, Tensor> contact_gradients(const Tensor& multiplier, const Ten
 struct AdjointSystem {
   Tensor right, inertia, inverse;
   OptionalTensor projector, sliding;  // with contacts
+  at::TensorList pairs = {};          // between bodies, see ConjugateTensors
 };
 
 // The multiplier, and relative residuals of every environment: of the symmetric system, and of the one with friction
@@ -195,14 +196,33 @@ AdjointSolution iterate(const Tensor& positions, const AdjointSystem& s, at::Ten
   const Tensor residual = right.clone();
   const at::TensorOptions numbers = x.options().dtype(at::kDouble);
   const Tensor progress = at::full({x.size(0), progress_count}, -1.0, numbers);
+  const bool rubs = s.sliding || !s.pairs.empty();
   OptionalTensor friction;
-  if (s.sliding) friction = at::zeros({x.size(0), friction_count}, numbers);
+  if (rubs) friction = at::zeros({x.size(0), friction_count}, numbers);
   solve_conjugate<Backend>(
       {solution, residual, direction, progress, x, s.inertia, s.inverse, s.projector, material,
-       plan, s.sliding, right, friction, start, time_step},
-      tolerance, (s.sliding ? 2 : 1) * adjoint_iterations);
+       plan, s.sliding, right, friction, start, time_step, s.pairs},
+      tolerance, (rubs ? 2 : 1) * adjoint_iterations);
   return {solution, progress.select(1, progress_error),
           friction ? friction->select(1, friction_error) : Tensor()};
+}
+
+// The system of a step with the `pairs` of bodies in contact, see ConjugateTensors.
+template <class Backend>
+std::tuple<Tensor, Tensor> contact_conjugate(const Tensor& positions, const Tensor& right,
+                                             const Tensor& inertia, const Tensor& inverse,
+                                             const OptionalTensor& projector,
+                                             at::TensorList material, at::TensorList plan,
+                                             const OptionalTensor& sliding,
+                                             const OptionalTensor& start, at::TensorList pairs,
+                                             double tolerance, double time_step) {
+  check_positions(positions, "positions");
+  check_state(right, positions, "right", "N");
+  const AdjointSolution found =
+      iterate<Backend>(positions, {right, inertia, inverse, projector, sliding, pairs}, material,
+                       plan, tolerance, start, time_step);
+  return {found.solution, found.friction.defined() ? at::maximum(found.error, found.friction)
+                                                   : found.error.contiguous()};
 }
 
 template <class Backend>
@@ -213,24 +233,28 @@ std::tuple<Tensor, Tensor> conjugate_gradients(const Tensor& positions, const Te
                                                const OptionalTensor& sliding,
                                                const OptionalTensor& start, double tolerance,
                                                double time_step) {
-  check_positions(positions, "positions");
-  check_state(right, positions, "right", "N");
-  const AdjointSolution found =
-      iterate<Backend>(positions, {right, inertia, inverse, projector, sliding}, material, plan,
-                       tolerance, start, time_step);
-  return {found.solution,
-          sliding ? at::maximum(found.error, found.friction) : found.error.contiguous()};
+  return contact_conjugate<Backend>(positions, right, inertia, inverse, projector, material, plan,
+                                    sliding, start, {}, tolerance, time_step);
 }
 
 // The solution with the fallback for failed environments, and the warnings: torchpd/ops/adjoint.py.
 inline Tensor apply_fallback(const AdjointTensors& t, const AdjointSystem& s, double time_step,
                              const AdjointSolution& found) {
+  const OptionalTensor friction =
+      found.friction.defined() ? OptionalTensor(found.friction) : OptionalTensor();
+  if (!s.pairs.empty()) {
+    static const auto with_pairs =
+        find_op<Tensor(const Tensor&, const Tensor&, const OptionalTensor&, const Tensor&,
+                       const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
+                       at::TensorList, const OptionalTensor&, at::TensorList, double)>(
+            "torchpd::contact_fallback");
+    return with_pairs.call(found.solution, found.error, friction, t.after, s.right, s.inverse,
+                           s.projector, t.material, t.plan, start_of(t), s.pairs, time_step);
+  }
   static const auto op =
       find_op<Tensor(const Tensor&, const Tensor&, const OptionalTensor&, const Tensor&,
                      const Tensor&, const Tensor&, const OptionalTensor&, at::TensorList,
                      at::TensorList, const OptionalTensor&, double)>("torchpd::adjoint_fallback");
-  const OptionalTensor friction =
-      found.friction.defined() ? OptionalTensor(found.friction) : OptionalTensor();
   return op.call(found.solution, found.error, friction, t.after, s.right, s.inverse, s.projector,
                  t.material, t.plan, start_of(t), time_step);
 }

@@ -20,6 +20,7 @@ struct ConjugateTensors {
   OptionalTensor sliding, right, friction;  // all or none
   OptionalTensor start = {};                // of the step whose dissipation counts
   double time_step = 0;
+  at::TensorList pairs = {};  // between bodies, see Backend::loaded_pairs; none: no pairs
 };
 
 template <class Backend, class T>
@@ -72,6 +73,12 @@ void conjugate_typed(const ConjugateTensors& t, double tolerance, std::int64_t i
   call.progress = t.progress.mutable_data_ptr<double>();
   call.tolerance = tolerance;
   call.iterations = int(iterations);
+  const auto pairs = Backend::template loaded_pairs<T>(t.pairs, call.batch, call.plan.vertices);
+  if (pairs) {
+    call.pairs = &*pairs;
+    call.right = t.right->const_data_ptr<T>();
+    call.friction = t.friction->mutable_data_ptr<double>();
+  }
   if (call.batch > 0 && iterations > 0) Backend::conjugate(call, t.positions);
 }
 

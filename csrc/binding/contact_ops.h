@@ -28,6 +28,8 @@ enum ContactArray : int {
   contact_edge_order,
   contact_rest_key,
   contact_rest_thickness,
+  contact_rest,
+  contact_rest_apart,
   contact_local,
   contact_cell,
   contact_friction,
@@ -84,6 +86,8 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
   plan.rest_key = static_cast<const std::int64_t*>(array(
       contact_rest_key, at::kLong, plan.rest_pairs, 1, "keys of pairs that are close at rest"));
   plan.rest_thickness = reals(contact_rest_thickness, plan.rest_pairs, 1, "their thickness [m]");
+  plan.rest = reals(contact_rest, body_vertices, 3, "vertices about the middles of bodies [m]");
+  plan.rest_apart = reals(contact_rest_apart, plan.bodies, 1, "least distance of parts [m]");
   plan.local =
       reals(contact_local, plan.vertices - plan.body_vertices, 3, "points of colliders [m]");
   plan.cell = reals(contact_cell, plan.vertices, 1, "mean edge of each vertex's body [m]");

@@ -1,6 +1,7 @@
 // The ops: schemas, and their CPU implementation.
 #include "binding/rollout_adjoint.h"
 
+#include "binding/contact_adjoint_ops.h"
 #include "binding/contact_ops.h"
 #include "binding/history_ops.h"
 #include "binding/plan_views.h"
@@ -9,6 +10,7 @@
 #include <ATen/Parallel.h>
 
 #include <algorithm>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -55,9 +57,12 @@ struct Cpu {
     kernels().contact_step64(call, contact, threads());
   }
   // the step itself finds its residual
-  static void report_contact(const StepTensors& taken, const Numbers& n, const Tensor&,
+  static void report_contact(const StepTensors& taken, const Numbers& n, const Tensor& numbers,
                              const Tensor&) {
     report_step<Cpu>(taken, n);
+    // environments without contact in this step have the residual of the others
+    const Tensor residual = numbers.select(1, contact_residual);
+    residual.copy_(at::where(residual.isnan(), taken.info.select(1, info_residual), residual));
   }
   static void field(const FieldCall<float>& call, const Tensor&) {
     kernels().field32(call, threads());
@@ -78,10 +83,10 @@ struct Cpu {
     kernels().precondition64(call, threads());
   }
   static void conjugate(const ConjugateCall<float>& call, const Tensor&) {
-    kernels().conjugate32(call, threads());
+    (call.pairs ? kernels().contact_conjugate32 : kernels().conjugate32)(call, threads());
   }
   static void conjugate(const ConjugateCall<double>& call, const Tensor&) {
-    kernels().conjugate64(call, threads());
+    (call.pairs ? kernels().contact_conjugate64 : kernels().conjugate64)(call, threads());
   }
   static void adjoint_system(const AdjointSystemCall<float>& call, const Tensor&) {
     kernels().adjoint_system32(call, threads());
@@ -117,11 +122,24 @@ struct Cpu {
       }
     });
   }
+  static void pair_gradients(const PairGradientsCall<float>& call) {
+    kernels().pair_gradients32(call, threads());
+  }
+  static void pair_gradients(const PairGradientsCall<double>& call) {
+    kernels().pair_gradients64(call, threads());
+  }
   static void rotation(const RotationCall<float>& call, const Tensor&) {
     kernels().rotation32(call, threads());
   }
   static void rotation(const RotationCall<double>& call, const Tensor&) {
     kernels().rotation64(call, threads());
+  }
+
+  template <class T>
+  static std::optional<LoadedPairs<T>> loaded_pairs(at::TensorList pairs, std::int64_t batch,
+                                                    std::int64_t vertices) {
+    if (pairs.empty()) return {};
+    return loaded_pairs_view<T>(pairs, batch, vertices);
   }
 
   static bool recording(const Tensor&) { return false; }
@@ -199,11 +217,20 @@ TORCH_LIBRARY(torchpd, m) {
       "rollout_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
       "after_velocities, Tensor positions, Tensor velocities, Tensor? forces, Tensor[] material, "
       "Tensor[] plan, *, float time_step, bool[]? wanted=None) -> Tensor[]");
+  with_plan(
+      "contact_step_vjp(Tensor grad_positions, Tensor grad_velocities, Tensor grad_poses, Tensor "
+      "after, Tensor positions, Tensor velocities, Tensor? forces, Tensor poses, Tensor[] history, "
+      "Tensor pushes, Tensor taken_back, Tensor[] material, Tensor[] plan, Tensor[] contact, *, "
+      "float time_step, bool[]? wanted=None) -> Tensor[]");
   // its kernel, for every device, comes from Python
   with_plan(
       "adjoint_fallback(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor "
       "right, Tensor inverse, Tensor? projector, Tensor[] material, Tensor[] plan, Tensor? "
       "start=None, *, float time_step) -> Tensor");
+  with_plan(
+      "contact_fallback(Tensor solution, Tensor error, Tensor? friction, Tensor after, Tensor "
+      "right, Tensor inverse, Tensor? projector, Tensor[] material, Tensor[] plan, Tensor? start, "
+      "Tensor[] pairs, *, float time_step) -> Tensor");
   with_plan(
       "adjoint_system(Tensor grad_positions, Tensor grad_velocities, Tensor after, Tensor "
       "positions, Tensor "
@@ -226,6 +253,10 @@ TORCH_LIBRARY(torchpd, m) {
       "tolerance, float time_step=0.0) -> "
       "(Tensor, Tensor)");
   with_plan(
+      "contact_conjugate(Tensor positions, Tensor right, Tensor inertia, Tensor inverse, Tensor? "
+      "projector, Tensor[] material, Tensor[] plan, Tensor? sliding, Tensor? start, Tensor[] "
+      "pairs, *, float tolerance, float time_step=0.0) -> (Tensor, Tensor)");
+  with_plan(
       "conjugate_gradients_(Tensor(a!) solution, Tensor(b!) residual, Tensor(c!) direction, "
       "Tensor(d!) "
       "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor[] "
@@ -240,6 +271,7 @@ TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
   register_adjoint_ops<Cpu>(m);
   register_history_ops<Cpu>(m);
   register_contact_ops<Cpu>(m);
+  register_contact_adjoint<Cpu>(m);
 }
 
 }  // namespace pd

@@ -13,6 +13,7 @@ struct AdjointTensors {
   Tensor grad_positions, grad_velocities, after, positions, velocities;
   OptionalTensor forces;
   at::TensorList material, plan;
+  Tensor pushes = {};  // forces between bodies [batch, vertices, 3]; undefined without
 };
 
 // The start of a step with damping.
@@ -48,8 +49,9 @@ class SolvedStep {
     if (t.forces) call.forces = keep(*t.forces);
     const StepOfField step =
         has_damping(t.material) ? StepOfField{time_step, t.positions} : StepOfField{};
-    call.elastic_gradient = keep(
-        run_field<Backend>(Field::gradient, t.after.contiguous(), {}, t.material, t.plan, step));
+    const Tensor gradient =
+        run_field<Backend>(Field::gradient, t.after.contiguous(), {}, t.material, t.plan, step);
+    call.elastic_gradient = keep(t.pushes.defined() ? gradient - t.pushes : gradient);
   }
   SolvedStep(const SolvedStep&) = delete;
 

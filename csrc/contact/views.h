@@ -14,6 +14,9 @@ struct ContactPlan {
   const std::int64_t*
       rest_key;             // [rest_pairs] of pairs that are closer than 2 r at rest, increasing
   const T* rest_thickness;  // [rest_pairs]
+  // [body_vertices, 3] about the middle of the surface of each body; [bodies] least distance of parts of a solid that share
+  // no vertex, or 0
+  const T *rest, *rest_apart;
   const T *local, *cell, *friction;  // [vertices, 3] of colliders; [vertices]; [bodies, bodies]
   int vertices = 0, body_vertices = 0, triangles = 0, edges = 0, points = 0, bodies = 0,
       colliders = 0, capacity = 0;
@@ -34,14 +37,14 @@ struct ContactHistory {
 
 // Numbers about the contact of an environment in the last step.
 enum ContactInfo : int {
-  contact_gap,       // least d / r, inf without pairs
-  contact_overflow,  // pairs that the capacity lacks
-  contact_pairs,     // most pairs in a list
-  contact_searches,
-  contact_shortened,       // vertices whose way was cut, summed over iterations
-  contact_frozen,          // vertices that no plane let move, summed over iterations
+  contact_gap,             // least d / r, inf without pairs
+  contact_overflow,        // pairs that the capacity lacks
   contact_pins_held_back,  // m
   contact_residual,        // share of the forces that is not balanced; NaN unless requested
+  contact_pairs,           // most pairs in a list
+  contact_searches,
+  contact_shortened,  // vertices whose way was cut, summed over iterations
+  contact_frozen,     // vertices that no plane let move, summed over iterations
   contact_info_count
 };
 

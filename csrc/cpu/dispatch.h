@@ -1,6 +1,7 @@
 // Which compiled instruction set this machine runs.
 #pragma once
 #include "contact/views.h"
+#include "cpu/adjoint/pair_views.h"
 #include "views/views.h"
 
 #include <string>
@@ -31,6 +32,10 @@ struct Kernels {
   void (*contact_gradients64)(const ContactGradientsCall<double>&, int threads);
   void (*adjoint_result32)(const AdjointResultCall<float>&, int threads);
   void (*adjoint_result64)(const AdjointResultCall<double>&, int threads);
+  void (*contact_conjugate32)(const ConjugateCall<float>&, int threads);
+  void (*contact_conjugate64)(const ConjugateCall<double>&, int threads);
+  void (*pair_gradients32)(const PairGradientsCall<float>&, int threads);
+  void (*pair_gradients64)(const PairGradientsCall<double>&, int threads);
   void (*flops)(float* seconds, std::int64_t* operations);  // multiply-add loop, for calibration
 };
 

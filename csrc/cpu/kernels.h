@@ -109,6 +109,10 @@ void step_any(const StepCall<T>& call, int threads) {
   has_contacts ? step_with<true>(call, threads) : step_with<false>(call, threads);
 }
 
+// contact/kernels.h calls it, too
+template void step_any(const StepCall<float>&, int);
+template void step_any(const StepCall<double>&, int);
+
 // In a translation unit of its own: cpu/contact/kernels.h.
 template <class T>
 void contact_step_any(const StepCall<T>& call, const ContactCall<T>& contact, int threads);
@@ -133,7 +137,7 @@ void conjugate_any(const ConjugateCall<T>& call, int threads) {
     std::atomic<std::int64_t> next{0};
     run_team(int(std::min<std::int64_t>(threads, call.batch)), [&](const Team& team) {
       const CleanRegisters clean;
-      ConjugateMemory<T> work(call);
+      ConjugateMemory<T, false> work(call);
       Scratch<Lanes> scratch(call.plan.most_slots);
       const Team alone = team.alone();
       ConjugatePass<T> pass(call, work, scratch, alone);
@@ -141,7 +145,7 @@ void conjugate_any(const ConjugateCall<T>& call, int threads) {
     });
     return;
   }
-  ConjugateMemory<T> work(call);
+  ConjugateMemory<T, false> work(call);
   auto scratches = make_scratches<Lanes>(call.plan, threads);
   run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
     const CleanRegisters clean;
@@ -149,6 +153,12 @@ void conjugate_any(const ConjugateCall<T>& call, int threads) {
     for (std::int64_t e = 0; e < call.batch; ++e) pass.run(e);
   });
 }
+
+// In a translation unit of their own: cpu/adjoint/contact_kernels.h.
+template <class T>
+void contact_conjugate_any(const ConjugateCall<T>& call, int threads);
+template <class T>
+void pair_gradients_any(const PairGradientsCall<T>& call, int threads);
 
 // Applies M to the fields, environment by environment.
 template <class T>
@@ -263,6 +273,10 @@ const Kernels PD_KERNELS = {PD_NAME,
                             &contact_gradients_any<double>,
                             &adjoint_result_any<float>,
                             &adjoint_result_any<double>,
+                            &contact_conjugate_any<float>,
+                            &contact_conjugate_any<double>,
+                            &pair_gradients_any<float>,
+                            &pair_gradients_any<double>,
                             &multiply_add_loop};
 
 }  // namespace pd

@@ -488,6 +488,9 @@ struct AdjointResultCall {
   T* out_multiplier = nullptr;
 };
 
+template <class T>
+struct LoadedPairs;  // cpu/adjoint/pair_views.h
+
 // An environment's entries in the progress of a solve: r . z; |right side|; 1 while it runs, 0 after, -1 before; and
 // the residual relative to the right side. The first iteration computes the other entries from a residual that equals
 // the right side. The error is NaN if right side or positions are infinite or NaN.
@@ -530,9 +533,10 @@ struct ConjugateCall : P::EffectViews {
   T* solution = nullptr;       // [batch, vertices, 3] each, from zero
   T* residual = nullptr;
   T* direction = nullptr;
-  double* progress = nullptr;  // [batch, progress_count]
-  double tolerance = 0;        // of the residual, relative to the right side
-  int iterations = 0;          // counts products if friction follows
+  double* progress = nullptr;             // [batch, progress_count]
+  double tolerance = 0;                   // of the residual, relative to the right side
+  int iterations = 0;                     // counts products if friction follows
+  const LoadedPairs<T>* pairs = nullptr;  // of surfaces, on a CPU from zero alone; may be null
 };
 
 // Applies the approximation of A^-1 to a vector for each vertex.

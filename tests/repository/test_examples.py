@@ -66,6 +66,34 @@ def test_no_example_is_left_out() -> None:
     assert tested == {path.name for path in EXAMPLES.glob("*.py")}
 
 
+def finger_ends(text: str) -> tuple[list[float], list[float]]:
+    """What the cube carries and holds [N], and heights of the tip [mm]."""
+    forces = numbers(text, r"carries (\S+) N of 4\.9050 N, and holds (\S+) N of 1\.0000 N")
+    return forces, [float(height) for height in re.findall(r"tip at +(\S+) mm", text)]
+
+
+def test_mujoco_finger_without_mujoco(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop with an integrator of its own: the wrench is weight and pull. A light finger hops ever higher."""
+    (carried, held), _ = finger_ends(run("mujoco_finger.py", "--engine", "own", "--steps", "60"))
+    assert carried == pytest.approx(0.5 * 9.81, rel=2e-3)
+    assert held == pytest.approx(1.0, rel=2e-2)
+    text = run("mujoco_finger.py", "--engine", "own", "--steps", "24", "--mass", "0.05", "--damping", "0")
+    assert "too light" in text
+    assert max(float(height) for height in re.findall(r"tip at +(\S+) mm", text)) > 100.0
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(SystemExit, match="pip install mujoco"):
+        run("mujoco_finger.py")
+
+
+def test_mujoco_finger(run) -> None:
+    """MuJoCo's own integrator does the same."""
+    pytest.importorskip("mujoco")
+    there, heights = finger_ends(run("mujoco_finger.py", "--steps", "24"))
+    own, same = finger_ends(run("mujoco_finger.py", "--engine", "own", "--steps", "24"))
+    assert there == pytest.approx(own, abs=1e-3)
+    assert heights == pytest.approx(same, abs=1e-2)
+
+
 @pytest.mark.parametrize("ending", ["glb", "ply"])
 def test_drop_body(run, tmp_path: Path, ending: str) -> None:
     out = tmp_path / f"end.{ending}"
@@ -245,6 +273,20 @@ def test_lift_cube(run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert Image.open("lift.png").size[0] > 4 * 48
     lifted, _ = numbers(run("lift_cube.py", "--cells", "2", "--friction", "0"), cube)
     assert abs(lifted) < 1e-3
+
+
+@pytest.mark.parametrize("scene", ["rings", "knot", "pile", "drape", "fold", "plates", "batch"])
+def test_contact_scenes(run, monkeypatch: pytest.MonkeyPatch, scene: str) -> None:
+    """Each starts and ends without crossings, its whole motion within four steps; one is drawn."""
+    studio = viewing.Studio
+    monkeypatch.setattr(viewing, "Studio", lambda *a, **more: studio(*a, **{**more, "size": (48, 36), "samples": 1}))
+    out = ("--out", "rings.png", "--frames", "2") if scene == "rings" else ()
+    text = run("contact_scenes.py", "--scene", scene, "--steps", "4", *out)
+    environments, _ = numbers(text, rf"{scene}: (\d+) environments of (\d+) triangles, no crossing")
+    assert environments == (256 if scene == "batch" else 1)
+    assert numbers(text, r"capacity lacks: (\d+)") == [0.0]
+    if out:
+        assert Image.open("rings.png").size[0] > 2 * 48
 
 
 def test_read_forces(run, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..estimate.solver_choice import runs
 from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Jacobi, Multilevel, Newton, Solver
-from ..simulation.state import State
+from ..simulation.state import HistoryState, State
 from .spectral_radius import estimate_rho
 
 if TYPE_CHECKING:
@@ -24,13 +24,13 @@ class Candidate:
     `make(sim, state)` may run trials from the state. `safe` solvers cannot diverge, on any mesh and at any stiffness.
     """
 
-    make: Callable[[Stepper, State], Solver]
+    make: Callable[[Stepper, State | HistoryState], Solver]
     safe: bool
     devices: tuple[str, ...] = ("cpu", "cuda")  # where it runs
     of_solids: bool = True  # whether `tune` tries it where there are solids alone
 
 
-def _classic(sim: Stepper, state: State) -> Solver:
+def _classic(sim: Stepper, state: State | HistoryState) -> Solver:
     """The schedule of the papers, with their two-stage estimate of rho."""
     own = sim.solver
     sim.solver = Jacobi(diagonal="plain")
@@ -52,7 +52,7 @@ CANDIDATES: dict[str, Candidate] = {
 DEFAULT = "guarded Chebyshev"  # the solver of `Simulator(scene)`
 
 
-def safe_candidates(sim: Stepper, state: State) -> dict[str, Solver]:
+def safe_candidates(sim: Stepper, state: State | HistoryState) -> dict[str, Solver]:
     """Solvers that cannot diverge, run on the simulator's device and suit its scene, the default first."""
     others = sim.compiled.has_stencils
     here = {

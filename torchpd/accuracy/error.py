@@ -299,6 +299,8 @@ def settled_steps(
     longer runs of Chebyshev. `ExactStep.uncertainty` is the change by the last two runs. It stays large if the
     iterations cycle, for example between sticking and slipping. `ExactStep.errors_of` ignores friction.
 
+    Steps with `Contact` have runs of Chebyshev alone, each from the start. `errors_of` is then of positions alone.
+
     Args:
         sim: scene, time step and material; its solver and device do not matter.
         state: start of the steps [B, V, 3].
@@ -317,12 +319,11 @@ def settled_steps(
 
         problems = [problem_of(sim, state, item, forces=forces) for item in range(len(wide.positions))]
         first = torch.from_numpy(np.stack([problem.unsolved() for problem in problems]))
-        after, moves = (
-            run(Multilevel(), _LEADING),
-            [torch.inf * torch.ones(len(first), dtype=torch.float64)],
-        )
+        anew = sim.scene.contact is not None  # whose steps take no positions to start from
+        after = run(Chebyshev() if anew else Multilevel(), _LEADING)
+        moves = [torch.inf * torch.ones(len(first), dtype=torch.float64)]
         for iterations in _SETTLING:
-            before, after = after, run(Chebyshev(), iterations, after.positions)
+            before, after = after, run(Chebyshev(), iterations, "velocity" if anew else after.positions)
             # from velocities, because a difference of positions loses digits
             moves.append((after.velocities - before.velocities).flatten(1).norm(dim=1) * twin.time_step)
             scale = (first - after.velocities * twin.time_step).flatten(1).norm(dim=1)

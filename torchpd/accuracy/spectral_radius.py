@@ -12,7 +12,7 @@ from torch import Tensor
 from ..common.checks import check_has_values
 from ..ops.diagonal import has_damping, step_diagonal
 from ..scene.solvers import Chebyshev, Jacobi
-from ..simulation.state import State
+from ..simulation.state import HistoryState, State
 
 if TYPE_CHECKING:
     from ..simulation.stepper import Stepper
@@ -36,7 +36,7 @@ def _bound(sim: Stepper) -> float:
     return 1.0 - relaxation * float(ratio.min())
 
 
-def _power(sim: Stepper, state: State, iterations: int) -> float:
+def _power(sim: Stepper, state: State | HistoryState, iterations: int) -> float:
     """Largest |eigenvalue| of I - theta D^-1 H at the state; H is the Hessian of the step's objective."""
     settings = sim.solver.settings()
     inertia, diagonal = (t.unsqueeze(-1) for t in _diagonal(sim))
@@ -64,13 +64,13 @@ def _trial(sim: Stepper, solver: Jacobi | Chebyshev, iterations: int) -> Stepper
     return trial
 
 
-def _residual(sim: Stepper, state: State, solver: Jacobi | Chebyshev, iterations: int) -> float:
+def _residual(sim: Stepper, state: State | HistoryState, solver: Jacobi | Chebyshev, iterations: int) -> float:
     _, info = _trial(sim, solver, iterations)(state, return_info=True)
     worst = float(info.residual.max())
     return worst if math.isfinite(worst) else math.inf
 
 
-def _two_stage(sim: Stepper, state: State, iterations: int) -> float:
+def _two_stage(sim: Stepper, state: State | HistoryState, iterations: int) -> float:
     """The pre-simulation of the source paper: a ratio of residuals, then trial runs around it."""
     settings = sim.solver.settings()
     diagonal: Literal["weighted", "plain"] = "weighted" if settings["weighted"] else "plain"
@@ -85,12 +85,12 @@ def _two_stage(sim: Stepper, state: State, iterations: int) -> float:
     return best[1]
 
 
-def _check_state(sim: Stepper, state: State) -> None:
+def _check_state(sim: Stepper, state: State | HistoryState) -> None:
     check_has_values("estimate_rho", sim.device)
     positions = sim.positions_of(state)
     if not len(positions):
         raise ValueError(f"estimate_rho: state must hold at least one environment, got {list(positions.shape)}")
-    for name, part in zip(State._fields, state, strict=True):
+    for name, part in zip(State._fields, state[:2], strict=True):
         if not bool(part.isfinite().all()):
             raise ValueError(f"estimate_rho: state.{name} must be finite, got NaN or infinity")
 
@@ -98,7 +98,7 @@ def _check_state(sim: Stepper, state: State) -> None:
 @torch.no_grad()
 def estimate_rho(
     sim: Stepper,
-    state: State,
+    state: State | HistoryState,
     method: Literal["two-stage", "power", "bound"] = "two-stage",
     *,
     iterations: int = 64,

@@ -14,7 +14,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from ..scene.pins import PIN_HARD
 from ..scene.solvers import Chebyshev, Multilevel, Newton, Solver
 from ..scene.targets import Targets
 from ..simulation.parametrization import plain_copy
-from ..simulation.state import State
+from ..simulation.state import HistoryState, State, chosen, joined, named_state
 from .candidates import safe_candidates
 from .error import ExactStep, exact_steps, settled_steps
 from .tuning_checks import check_known, check_request, check_start
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from ..simulation.stepper import Stepper
 
 __all__ = ["TuningWarning", "tune"]
+
+AnyState: TypeAlias = State | HistoryState
 
 MOST_ITERATIONS = 2048
 # Safety factor of the error bound over studied errors, because other states may be harder. Studied errors may contain
@@ -68,7 +70,7 @@ class _Study:
     """Inputs of every trial."""
 
     sim: Stepper  # its batch the studied states
-    state: State
+    state: AnyState
     forces: Tensor | None
     exact: list[ExactStep]
 
@@ -102,7 +104,7 @@ class _Study:
 
 def tune(
     sim: Stepper,
-    state: State | None = None,
+    state: AnyState | None = None,
     *,
     error: float | None = None,
     milliseconds: float | None = None,
@@ -123,16 +125,11 @@ def tune(
     for solver in candidates or ():
         if not isinstance(solver, Solver):
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
-    if sim.keeps_history:
-        raise ValueError(
-            "tune: the scene must have no plastic solids and no Contact, which its study does not follow, got some; "
-            "set solver and iterations"
-        )
-    start = sim.rest_state() if state is None else state
-    check_start(sim, start, forces)
+    start = named_state(sim.rest_state() if state is None else state)
+    check_start(sim, start, forces, targets)
     study = _make_study(_with_targets(sim, targets, len(start[0])), start, forces, error)
-    # steps with friction may not settle; their uncertainty counts as error, so that the target is not attained
-    if not has_friction(sim.compiled):
+    # steps that are no minimum may not settle; their uncertainty counts as error, so that the target is not attained
+    if _is_minimum(sim):
         check_known(study.exact, _allowed_uncertainty(error))
     named: Mapping[str, Solver] = (
         _default_candidates(sim, safe_candidates(study.sim, study.state))
@@ -153,7 +150,7 @@ def tune(
                 bar.update(1)
             trials, cost = _most_accurate(study, timed)
     result = _result(sim, study, start, trials, cost, error, milliseconds)
-    if candidates is None and has_friction(sim.compiled):
+    if candidates is None and has_friction(sim.compiled) and runs(Multilevel(), sim.compiled):
         result = replace(result, left_out="Multilevel, not tried because of friction, might reach it: see candidates")
     sim.solver, sim.iterations, sim.tolerance, sim.tuning_result = result.solver, result.iterations, 0.0, result
     if not result.attained:
@@ -166,6 +163,11 @@ def tune(
             TuningWarning,
         )
     return result
+
+
+def _is_minimum(sim: Stepper) -> bool:
+    """Whether a step minimises an energy, without friction and contact between bodies."""
+    return not has_friction(sim.compiled) and sim.scene.contact is None
 
 
 def _default_candidates(sim: Stepper, solvers: Mapping[str, Solver]) -> dict[str, Solver]:
@@ -190,18 +192,18 @@ def _with_targets(sim: Stepper, targets: Targets | None, batch: int) -> Stepper:
 
 
 @torch.no_grad()
-def _make_study(sim: Stepper, start: State, forces: Tensor | None, error: float | None) -> _Study:
+def _make_study(sim: Stepper, start: AnyState, forces: Tensor | None, error: float | None) -> _Study:
     """Study states of the motion from `start`, with their converged steps; free fall is left out."""
     items = _environments(sim, len(start[0]))
     some = _of_environments(sim, items, len(start[0]))
     some.tolerance = 0.0
     given = None if forces is None else forces.detach()[items]
-    begun = State(start[0][items], start[1][items])
+    begun = chosen(start, items)
     states = [state for turned in (begun, *_turned_starts(some, begun)) for state in _motion(some, turned, given)]
     everyone = _of_environments(some, list(range(len(items))) * len(states), len(items))
-    state = State(*(torch.cat(parts) for parts in zip(*states, strict=True)))
+    state = joined(states)
     repeated = None if given is None else given.repeat(len(states), 1, 1)
-    if has_friction(sim.compiled):
+    if not _is_minimum(sim):
         exact = settled_steps(everyone, state, forces=repeated, enough=_SETTLED * (error or _COARSE))
     else:
         exact = exact_steps(everyone, state, forces=repeated)
@@ -215,9 +217,9 @@ def _make_study(sim: Stepper, start: State, forces: Tensor | None, error: float 
             "tune: this scene has no motion that needs solving: from the given state the bodies rest or fall freely; "
             "pass a state of the motion that matters, for example sim.tune(state, error=1e-2)"
         )
-    chosen = _of_environments(everyone, moving, len(exact))
+    picked = _of_environments(everyone, moving, len(exact))
     pushed = None if repeated is None else repeated[moving]
-    return _Study(chosen, State(state[0][moving], state[1][moving]), pushed, [exact[number] for number in moving])
+    return _Study(picked, chosen(state, moving), pushed, [exact[number] for number in moving])
 
 
 def _allowed_uncertainty(error: float | None) -> float:
@@ -240,7 +242,7 @@ def _environments(sim: Stepper, batch: int) -> list[int]:
     return sorted(items)
 
 
-def _turned_starts(sim: Stepper, start: State) -> list[State]:
+def _turned_starts(sim: Stepper, start: AnyState) -> list[AnyState]:
     """The start with velocities turned about the normal of rough ground, because sticking depends on the path."""
     planes = sim.planes.detach()
     if not bool((planes[..., PLANES["friction"]] > 0.0).any()):
@@ -254,13 +256,13 @@ def _turned_starts(sim: Stepper, start: State) -> list[State]:
     across = torch.linalg.cross(normal.expand_as(start[1]), start[1])
     along = (start[1] * normal).sum(dim=-1, keepdim=True) * normal
     return [
-        State(start[0], along + math.cos(angle) * (start[1] - along) + math.sin(angle) * across)
+        start._replace(velocities=along + math.cos(angle) * (start[1] - along) + math.sin(angle) * across)
         for angle in map(math.radians, _TURN_ANGLES)
         if bool(across.any())
     ]
 
 
-def _motion(sim: Stepper, start: State, forces: Tensor | None) -> list[State]:
+def _motion(sim: Stepper, start: AnyState, forces: Tensor | None) -> list[AnyState]:
     """The states before the steps `_STEPS`, solved accurately enough, and a few others.
 
     Turned states have the same shape and speeds in other directions: an equally likely motion that excites other modes.
@@ -275,12 +277,12 @@ def _motion(sim: Stepper, start: State, forces: Tensor | None) -> list[State]:
         mover.solver, mover.iterations = Chebyshev(), _MOVING_PLAINLY
     prober = copy.copy(mover)
     prober.iterations = mover.iterations // 5
-    states, state, hardest = [], start, list[tuple[float, State]]()
+    states, state, hardest = [], start, list[tuple[float, AnyState]]()
     for step in range(max(_STEPS) + 1):
         if step in _STEPS:
             states.append(state)
         if step in _TURNED:
-            states.append(State(state[0], state[1].roll(1, -1)))
+            states.append(state._replace(velocities=state[1].roll(1, -1)))
         after = mover(state, forces)
         if not bool(after[0].isfinite().all()):
             break
@@ -291,7 +293,7 @@ def _motion(sim: Stepper, start: State, forces: Tensor | None) -> list[State]:
     return [*states, *(state for _, state in hardest)]
 
 
-def _relative_error(rough: State, before: State, after: State, time_step: float) -> float:
+def _relative_error(rough: AnyState, before: AnyState, after: AnyState, time_step: float) -> float:
     """Error of a roughly solved step, relative to the change from x + h v, largest of the environments."""
     size = [(v - after[1]).flatten(1).norm(dim=1) for v in (rough[1], before[1])]
     rounding = 10.0 * torch.finfo(after[0].dtype).eps / time_step * after[0].flatten(1).norm(dim=1)
@@ -318,7 +320,7 @@ Seek = Callable[[Solver], list[Trial]]
 
 
 def _cheapest_for_error(
-    sim: Stepper, study: _Study, start: State, solvers: list[Solver], error: float, most: int, bar: tqdm[NoReturn]
+    sim: Stepper, study: _Study, start: AnyState, solvers: list[Solver], error: float, most: int, bar: tqdm[NoReturn]
 ) -> tuple[list[Trial], float]:
     """Trials of the cheapest solver that reaches an error, and its milliseconds; of the most accurate one if none does.
 
@@ -341,7 +343,7 @@ def _cheapest_for_error(
     return found[solver], costs[solver]
 
 
-def _affordable_iterations(sim: Stepper, start: State, solver: Solver, budget: float, most: int) -> int:
+def _affordable_iterations(sim: Stepper, start: AnyState, solver: Solver, budget: float, most: int) -> int:
     """Largest number of iterations within a time [ms], approximately."""
     few, many = 4, 20
     times = [_milliseconds(sim, start, Trial(solver, count, 0.0, ())) for count in (few, many)]
@@ -371,7 +373,7 @@ def _fewest_iterations(study: _Study, suffices: Callable[[Trial], bool], most: i
     return seek
 
 
-def _seek_for_time(sim: Stepper, study: _Study, start: State, budget: float | None, most: int) -> Seek:
+def _seek_for_time(sim: Stepper, study: _Study, start: AnyState, budget: float | None, most: int) -> Seek:
     """Find the most iterations of a solver within a budget [ms], from the times of two counts.
 
     Takes fewer if rounding then hides every error: as many as bring all errors below it.
@@ -400,7 +402,7 @@ def _seek_for_time(sim: Stepper, study: _Study, start: State, budget: float | No
 
 
 @torch.no_grad()
-def _milliseconds(sim: Stepper, start: State, trial: Trial) -> float:
+def _milliseconds(sim: Stepper, start: AnyState, trial: Trial) -> float:
     """Time of `sim(state)`: the lowest median of three series, so that one disturbance does not count."""
     timed = copy.copy(sim)
     timed.solver, timed.iterations, timed.tolerance = trial.solver, trial.iterations, 0.0
@@ -475,7 +477,7 @@ def _residual_limit(study: _Study, trials: list[Trial], bound: float) -> tuple[f
 def _result(
     sim: Stepper,
     study: _Study,
-    start: State,
+    start: AnyState,
     trials: list[Trial],
     cost: float,
     error: float | None,

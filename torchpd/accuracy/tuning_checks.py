@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from torch import Tensor
@@ -11,13 +11,17 @@ from torch import Tensor
 from ..common.checks import check_like
 from ..ops.diagonal import named_material, step_diagonal
 from ..plan.material import environments_of_material, named_arrays
-from ..simulation.state import State
+from ..scene.contact import Collider
+from ..scene.targets import Targets
+from ..simulation.state import HistoryState, State
 from .error import ExactStep
 
 if TYPE_CHECKING:
     from ..simulation.stepper import Stepper
 
 __all__ = ["check_known", "check_request", "check_start"]
+
+_UNBOUNDED = ("pin_stiffness", "max_flow")  # hard pins have infinite springs; flow has no limit by default
 
 
 def check_request(error: float | None, milliseconds: float | None) -> None:
@@ -34,8 +38,13 @@ def check_request(error: float | None, milliseconds: float | None) -> None:
         raise ValueError(f"tune: milliseconds must be positive and finite, got {milliseconds}")
 
 
-def check_start(sim: Stepper, state: State, forces: Tensor | None) -> None:
-    """Check that states, forces and material are finite and the system is not singular."""
+def check_start(sim: Stepper, state: State | HistoryState, forces: Tensor | None, targets: Targets | None) -> None:
+    """Check that states, forces and material are finite, the system is not singular, and colliders stay."""
+    if isinstance(targets, Mapping) and any(isinstance(part, Collider) for part in targets):
+        raise ValueError(
+            "tune: targets must not move a Collider, because the study keeps colliders where the state has them, got a "
+            "pose; leave it out, and pass a state of the motion that matters"
+        )
     sim.check_state(state, forces=forces)
     if forces is not None:
         check_like("forces", forces, state[0], "N")
@@ -44,14 +53,13 @@ def check_start(sim: Stepper, state: State, forces: Tensor | None) -> None:
     count = environments_of_material(named_arrays(sim))
     if count not in (1, len(state[0])):
         raise ValueError(f"tune: state must have the {count} environments of the material, got {len(state[0])}")
-    for name, part in zip(State._fields, state, strict=True):
+    for name, part in zip(State._fields, state[:2], strict=True):
         bad = (~part.isfinite()).flatten(1).any(1).nonzero()
         if len(bad):
             raise ValueError(f"tune: state.{name} must be finite, got NaN or infinity in environment {int(bad[0])}")
     values = {"forces": forces} if forces is not None else {}
     for name, array in (values | named_material(sim.material())).items():
-        # hard pins have infinite springs
-        bad = (array.isnan() if name == "pin_stiffness" else ~array.isfinite()).nonzero()
+        bad = (array.isnan() if name in _UNBOUNDED else ~array.isfinite()).nonzero()
         if len(bad):
             raise ValueError(f"tune: {name} must be finite, got NaN or infinity at {bad[0].tolist()}")
     inertia, diagonal = step_diagonal(sim.plan.arrays, sim.material(), sim.time_step)

@@ -20,7 +20,7 @@ from ..plan.preconditioner import has_preconditioner, precondition_plan, stored_
 from ..scene.solvers import Solver
 from ..scene.targets import Targets
 from ..simulation.cuda_graph import CapturedStep
-from ..simulation.state import State
+from ..simulation.state import HistoryState, State
 from ..simulation.stepper import Stepper
 
 __all__ = ["Simulator", "Targets"]
@@ -116,7 +116,7 @@ class Simulator(Stepper):
 
     def tune(
         self,
-        state: State | None = None,
+        state: State | HistoryState | None = None,
         *,
         error: float | None = None,
         milliseconds: float | None = None,
@@ -135,8 +135,9 @@ class Simulator(Stepper):
         `TuningWarning`. Files do not keep the result, because times depend on the machine.
 
         The study solves nine steps of each studied environment to convergence, in float64 on the CPU. That takes about
-        a second for a thousand vertices; docs/solvers.md has a table. Friction triples it at most. Where steps with
-        friction do not converge, as for stiff bodies that stick and slip, the target counts as not reached.
+        a second for a thousand vertices; docs/solvers.md has a table. Friction triples it at most, and `Contact` takes ten
+        times as long. Where steps with friction or `Contact` do not converge, as for stiff bodies that stick and slip,
+        the target counts as not reached. Colliders stay where the state has them.
 
         Args:
             state: start of typical motions [B, V, 3]; by default the rest state, once for each environment of the
@@ -152,8 +153,8 @@ class Simulator(Stepper):
             progress: show a bar.
 
         Raises:
-            ValueError: non-finite states, forces or material; a singular system; a scene without motion or with
-                plastic solids.
+            ValueError: non-finite states, forces or material; a singular system; a scene without motion; targets of
+                a `Collider`.
             RuntimeError: no converged step to compare with; solver and iterations stay.
         """
         from ..accuracy.tuning import tune  # imported here, because its baselines take 0.1 s to import

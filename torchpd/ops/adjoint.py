@@ -35,6 +35,8 @@ __all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "adjoint_fallback", "is_recording
 ADJOINT_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_tolerance, strict=True))
 # At this stretch the rotations hardly change, so the Hessian equals the constant, positive majoriser within 1e-4.
 _STRETCH = 1e4
+# In csrc/binding/contact_adjoint_ops.h: positions before and after a step, and points of colliders; poses.
+_PLACES_OF_PAIRS, _POSES_OF_PAIRS = (0, 1, 18), (2, 3)
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,17 @@ def _warn_of_friction(failed: Tensor, error: Tensor) -> None:
     )
 
 
+def _stretched(pairs: Sequence[Tensor]) -> list[Tensor]:
+    """Pairs at the stretch of the positions: their directions stay, and the curvature of distances vanishes."""
+    made = list(pairs)
+    for place in _PLACES_OF_PAIRS:
+        made[place] = _STRETCH * made[place]
+    for place in _POSES_OF_PAIRS:
+        origin, turn = made[place].split([3, 4], dim=-1)
+        made[place] = torch.cat([_STRETCH * origin, turn], dim=-1)
+    return made
+
+
 def adjoint_fallback(
     solution: Tensor,
     error: Tensor,
@@ -116,6 +129,7 @@ def adjoint_fallback(
     material: Sequence[Tensor],
     plan: Sequence[Tensor],
     start: Tensor | None = None,
+    pairs: Sequence[Tensor] = (),
     *,
     time_step: float,
 ) -> Tensor:
@@ -135,6 +149,7 @@ def adjoint_fallback(
         material: of the step.
         plan: of the scene.
         start: x [B, V, 3], in scenes with stiffness-proportional damping.
+        pairs: of surfaces in contact, csrc/binding/contact_adjoint_ops.h.
         time_step: h [s].
     """
     arrays, tolerance = list(plan), ADJOINT_TOLERANCE[right.dtype]
@@ -148,7 +163,7 @@ def adjoint_fallback(
         _warn_of_no_solution(failed, error)
     # the curvature of contact surfaces is no part of the majoriser
     inertia, _ = step_diagonal(arrays, material, time_step)
-    instead, _ = torch.ops.torchpd.conjugate_gradients(
+    system = (
         _STRETCH * after,
         torch.where(failed[:, None, None], right, 0.0),
         torch.where(torch.isfinite(inertia), inertia, 0.0),
@@ -158,7 +173,10 @@ def adjoint_fallback(
         arrays,
         None,
         start,
-        tolerance=tolerance,
-        time_step=time_step,
     )
+    accuracy = {"tolerance": tolerance, "time_step": time_step}
+    if pairs:
+        instead, _ = torch.ops.torchpd.contact_conjugate(*system, _stretched(pairs), **accuracy)
+    else:
+        instead, _ = torch.ops.torchpd.conjugate_gradients(*system, **accuracy)
     return torch.where(failed[:, None, None], instead, solution)

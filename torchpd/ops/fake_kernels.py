@@ -17,7 +17,9 @@ __all__ = ["INFO_WIDTH"]
 
 INFO_WIDTH = _C.info_numbers
 CONTACT_INFO_WIDTH = 8  # contact_info_count of csrc/contact/views.h
-CONTACT_BODY = 4  # place of the body of each vertex among the arrays of contact, csrc/binding/contact_ops.h
+CONTACT_MISSING = 1  # its column of pairs that the capacity lacks
+# places among the arrays of contact, csrc/binding/contact_ops.h: the body of each vertex, friction and thickness
+CONTACT_BODY, CONTACT_FRICTION, CONTACT_THICKNESS = 4, 16, 17
 
 
 def _register_fake(name: str) -> Callable[[Callable[..., Any]], None]:
@@ -79,6 +81,33 @@ def _(
     state = positions.new_empty(positions.shape), positions.new_empty(velocities.shape)
     pushes = positions.new_empty((batch, len(contact[CONTACT_BODY]), 3))
     return *state, info, numbers, held_back, *(part.new_empty(part.shape) for part in history), pushes
+
+
+@_register_fake("contact_step_vjp")
+def _(
+    grad_positions: Tensor,
+    grad_velocities: Tensor,
+    grad_poses: Tensor,
+    after: Tensor,
+    positions: Tensor,
+    velocities: Tensor,
+    forces: Tensor | None,
+    poses: Tensor,
+    history: Sequence[Tensor],
+    pushes: Tensor,
+    taken_back: Tensor,
+    material: Sequence[Tensor],
+    plan: Sequence[Tensor],
+    contact: Sequence[Tensor],
+    *,
+    time_step: float,
+    wanted: Sequence[bool] | None = None,
+) -> list[Tensor]:
+    state = [positions.new_empty(positions.shape) for _ in range(3)]
+    moved = [poses.new_empty(poses.shape) for _ in range(2)]
+    own = [contact[place].new_empty(contact[place].shape) for place in (CONTACT_FRICTION, CONTACT_THICKNESS)]
+    asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
+    return [*state, *moved, *own, *(array.new_empty(array.shape) for array, one in asked if one)]
 
 
 @_register_fake("gradient")
@@ -208,14 +237,17 @@ def _(multiplier: Tensor, *step: Any, time_step: float) -> tuple[Tensor, Tensor]
     return planes, spheres
 
 
-@_register_fake("conjugate_gradients")
-def _(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
+def _fake_solve(positions: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor]:
     return positions.new_empty(positions.shape), positions.new_empty(positions.shape[:1], dtype=torch.float64)
 
 
-@_register_fake("adjoint_fallback")
-def _(solution: Tensor, *_: Any, **__: Any) -> Tensor:
+def _fake_fallback(solution: Tensor, *_: Any, **__: Any) -> Tensor:
     return solution.new_empty(solution.shape)
+
+
+for _solve, _fallback in (("conjugate_gradients", "adjoint_fallback"), ("contact_conjugate", "contact_fallback")):
+    _register_fake(_solve)(_fake_solve)
+    _register_fake(_fallback)(_fake_fallback)
 
 
 def _fake_vjp(*call: Any, time_step: float, wanted: Sequence[bool] | None = None) -> list[Tensor]:

@@ -12,7 +12,7 @@ from torch.autograd import forward_ad
 from ..common.tables import MATERIAL_TABLE, MULTILEVEL_TABLE, PLAN_TABLE, STENCIL_TABLE
 from .adjoint import adjoint_fallback
 from .diagonal import CORE_COUNT, STIFFNESS_PLACE
-from .fake_kernels import INFO_WIDTH
+from .fake_kernels import CONTACT_FRICTION, CONTACT_MISSING, CONTACT_THICKNESS, INFO_WIDTH
 from .vmap import register_rule
 from .vmap_step import rollout_vjp_rule, step_vjp_rule
 
@@ -65,6 +65,11 @@ def refuse_forward_mode(*tensors: Tensor | None) -> None:
 
 
 @torch.library.impl("torchpd::adjoint_fallback", ("cpu", "cuda"))
+def _(*args: Any, time_step: float) -> Tensor:
+    return adjoint_fallback(*args, time_step=time_step)
+
+
+@torch.library.impl("torchpd::contact_fallback", "cpu")
 def _(*args: Any, time_step: float) -> Tensor:
     return adjoint_fallback(*args, time_step=time_step)
 
@@ -308,10 +313,68 @@ def _refuse_mapped_contact(*_: Any, **__: Any) -> Any:
     )
 
 
-def _refuse_contact_backward(ctx: Any, *_: Any) -> Any:
+def _save_contact(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+    positions, velocities, forces, poses, history, material, ctx.plan, contact = inputs
+    after, _, _, numbers, _, actual, keys, pair_forces, pushes = output
+    ctx.time_step, ctx.counts = keyword_only_inputs["time_step"], (len(history), len(material), len(contact))
+    ctx.set_materialize_grads(False)
+    kept = (history[0], actual, keys, pair_forces)
+    ctx.save_for_backward(positions, velocities, forces, poses, after, pushes, numbers, *kept, *material, *contact)
+
+
+def _contact_backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
+    grad_positions, grad_velocities, *_, grad_poses, _, of_forces, of_pushes = grads
+    if of_forces is not None or of_pushes is not None:
+        raise RuntimeError(
+            "torchpd::contact_step: forces of contact must not require gradients, got a loss that depends on them; "
+            "detach() them"
+        )
+    positions, velocities, forces, poses, after, pushes, numbers, *others = ctx.saved_tensors
+    history, others = others[:4], others[4:]
+    count_history, count_material, count_contact = ctx.counts
+    material, contact = others[:count_material], others[count_material:]
+
+    def known(gradient: Tensor | None, like: Tensor) -> Tensor:
+        return torch.zeros_like(like) if gradient is None else gradient
+
+    wanted = list(ctx.needs_input_grad[5])
+    x, v, f, target, start, friction, thickness, *asked = _ops.contact_step_vjp(
+        known(grad_positions, after),
+        known(grad_velocities, after),
+        known(grad_poses, poses),
+        after,
+        positions,
+        velocities,
+        forces,
+        poses,
+        history,
+        pushes,
+        numbers[:, CONTACT_MISSING] > 0,
+        material,
+        ctx.plan,
+        contact,
+        time_step=ctx.time_step,
+        wanted=wanted,
+    )
+    rows = iter(asked)
+    of_contact: list[Tensor | None] = [None] * count_contact
+    of_contact[CONTACT_FRICTION], of_contact[CONTACT_THICKNESS] = friction, thickness
+    return (
+        x,
+        v,
+        None if forces is None else f,
+        target,
+        [start, *[None] * (count_history - 1)],
+        [next(rows) if one else None for one in wanted],
+        _for_plan(ctx),
+        of_contact,
+    )
+
+
+def _refuse_second_derivatives(ctx: Any, *_: Any) -> Any:
     raise RuntimeError(
-        "torchpd::contact_step: a step with Contact has no derivative; detach() its inputs, or step under "
-        "torch.no_grad()"
+        "torchpd: a step has first derivatives only; differentiate without create_graph, or take differences of the "
+        "gradients of two steps"
     )
 
 
@@ -321,7 +384,8 @@ register_rule("rollout_vjp", rollout_vjp_rule)
 
 
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
-torch.library.register_autograd("torchpd::contact_step", _refuse_contact_backward, setup_context=_save_nothing)
+torch.library.register_autograd("torchpd::contact_step", _contact_backward, setup_context=_save_contact)
+torch.library.register_autograd("torchpd::contact_step_vjp", _refuse_second_derivatives, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::damping_gradient", _damping_backward, setup_context=_save_damping)
 torch.library.register_autograd("torchpd::next_history", _history_backward, setup_context=_save_history)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..geometry.closest_points import segment_distances, triangle_distances
 from .contact_tree import Boxes, ContactTree, contact_tree, meeting
 
-__all__ = ["NearPairs", "Primitives", "near_pairs", "own_vertices"]
+__all__ = ["NearPairs", "Primitives", "least_apart", "near_pairs", "own_vertices"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -80,10 +80,8 @@ def near_pairs(surface: Primitives, touching: Mask, thickness: float, tied: Inde
         ValueError: sides of a pair of one body touch at rest, and no tie joins them.
     """
     joined = _tied_keys(surface, tied)
-    keys, corners, distance = (np.concatenate(of) for of in zip(
-        _near_points(surface, touching, thickness), _near_edges(surface, touching, thickness), strict=True
-    ))  # fmt: skip
-    found = (distance < 2.0 * thickness) & ~np.isin(keys, joined)
+    keys, corners, distance = _near(surface, touching, np.full(len(surface.rest), thickness), joined)
+    found = distance < 2.0 * thickness
     keys, corners, distance = keys[found], corners[found], distance[found]
     if not distance.all():
         where = own_vertices(surface.body, corners[int(distance.argmin())].tolist())
@@ -97,6 +95,21 @@ def near_pairs(surface: Primitives, touching: Mask, thickness: float, tied: Inde
     return NearPairs(keys[order], np.concatenate([np.zeros(len(joined)), 0.5 * distance])[order])
 
 
+def least_apart(surface: Primitives, of: Mask, most: Array, tied: Index) -> Array:
+    """Least distance at rest [bodies] m between parts of a body that share no vertex, 0 for bodies not asked.
+
+    Args:
+        surface: the primitives.
+        of: [bodies] whether the distance of a body is wanted.
+        most: [bodies] m, beyond which no distance is looked for.
+        tied: vertices [n, 2] that ties join.
+    """
+    _, corners, distance = _near(surface, of, 0.5 * most[surface.body], _tied_keys(surface, tied))
+    least = np.where(of, most, 0.0)
+    np.minimum.at(least, surface.body[corners[:, 0]], distance)
+    return least
+
+
 def own_vertices(body: NDArray[Any], vertices: list[int]) -> str:
     """Name vertices of one body by its own numbers; `body` [N] has the body of each vertex."""
     number = int(body[vertices[0]])
@@ -104,9 +117,17 @@ def own_vertices(body: NDArray[Any], vertices: list[int]) -> str:
     return f"vertices {[vertex - start for vertex in vertices]} of body {number}"
 
 
-def _boxes(surface: Primitives, touching: Mask, tree: ContactTree, corners: Index, margin: float) -> Boxes:
-    """Boxes of primitives, wider by a margin; those of bodies that do not touch themselves meet nothing."""
-    x = surface.rest[corners]
+def _near(surface: Primitives, touching: Mask, margin: Array, joined: Index) -> tuple[Index, Index, Array]:
+    """Keys, corners [n, 4] and distances [n] m of pairs of one body whose boxes meet, but for `joined` keys."""
+    found = zip(_near_points(surface, touching, margin), _near_edges(surface, touching, margin), strict=True)
+    keys, corners, distance = (np.concatenate(part) for part in found)
+    keep = ~np.isin(keys, joined)
+    return keys[keep], corners[keep], distance[keep]
+
+
+def _boxes(surface: Primitives, touching: Mask, tree: ContactTree, corners: Index, margins: Array) -> Boxes:
+    """Boxes of primitives, wider by margins [N] m; those of bodies that do not touch themselves meet nothing."""
+    x, margin = surface.rest[corners], margins[corners[:, :1]]
     out = ~touching[surface.body[corners[:, :1]]]
     return Boxes.of(tree, np.where(out, np.inf, x.min(axis=1) - margin), np.where(out, -np.inf, x.max(axis=1) + margin))
 
@@ -120,7 +141,7 @@ def _apart(one: Index, other: Index) -> Mask:
     return apart
 
 
-def _near_points(surface: Primitives, touching: Mask, margin: float) -> tuple[Index, Index, Array]:
+def _near_points(surface: Primitives, touching: Mask, margin: Array) -> tuple[Index, Index, Array]:
     """Keys, corners [n, 4] and distances [n] m of vertices and triangles of one body whose boxes meet."""
     points, faces = surface.vertices[:, None], surface.triangles
     row, triangle = meeting(
@@ -134,7 +155,7 @@ def _near_points(surface: Primitives, touching: Mask, margin: float) -> tuple[In
     return surface.point_keys(corners[:, 0], triangle), corners, distance
 
 
-def _near_edges(surface: Primitives, touching: Mask, margin: float) -> tuple[Index, Index, Array]:
+def _near_edges(surface: Primitives, touching: Mask, margin: Array) -> tuple[Index, Index, Array]:
     """Keys, corners [n, 4] and distances [n] m of edges of one body whose boxes meet."""
     boxes = _boxes(surface, touching, surface.edge_tree, surface.edges, margin)
     first, second = meeting(boxes, boxes)

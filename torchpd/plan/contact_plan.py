@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..scene.contact import ContactValues, placed
 from ..scene.scene import SceneValues
-from .contact_near import NearPairs, Primitives, near_pairs, own_vertices
+from .contact_near import NearPairs, Primitives, least_apart, near_pairs, own_vertices
 from .contact_tree import ContactTree
 
 __all__ = ["FLOOR", "ContactPlan", "contact_plan"]
@@ -23,6 +23,7 @@ Mask = NDArray[np.bool_]
 FLOOR = 0.1  # least distance that is promised, over the thickness
 _EDGES_PER_THICKNESS = 20.0
 _PAIRS_PER_TRIANGLE = 16  # two layers that lie on each other have 11
+_APART = 0.7  # of the mean edge: a search in a step reaches over half of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +51,8 @@ class ContactPlan:
     triangle_tree: ContactTree
     edge_tree: ContactTree
     near: NearPairs
+    shape: Array  # [V, 3] m, places at rest about the middle of each body's surface
+    apart: Array  # [Q] m, least distance at rest between parts of a solid that share no vertex; 0 where not asked
     longest: float  # m, edge
 
     def check_resolution(self, dtype: torch.dtype) -> None:
@@ -109,6 +112,8 @@ def contact_plan(values: SceneValues) -> ContactPlan:
     _check_triangles(given, surface, thickness)
     kinematic = given.collider >= 0
     kinematic[values.pin_vertices[np.isinf(values.pin_stiffness)]] = True
+    tied = _tied(values)
+    solid = np.array([kind == "Solid" for kind in given.kinds]) & given.self_contact
     return ContactPlan(
         rest=surface.rest,
         triangles=surface.triangles.astype(np.int32),
@@ -127,9 +132,18 @@ def contact_plan(values: SceneValues) -> ContactPlan:
         vertex_tree=surface.vertex_tree,
         triangle_tree=surface.triangle_tree,
         edge_tree=surface.edge_tree,
-        near=near_pairs(surface, given.self_contact, thickness, _tied(values)),
+        near=near_pairs(surface, given.self_contact, thickness, tied),
+        shape=surface.rest[:own] - _middles(surface, bodies)[given.body[:own]],
+        apart=least_apart(surface, solid, _APART * mean, tied),
         longest=float(lengths.max()),
     )
+
+
+def _middles(surface: Primitives, bodies: int) -> Array:
+    """Mean places [bodies, 3] m of the vertices of surfaces."""
+    of, places = surface.body[surface.vertices], surface.rest[surface.vertices]
+    counts = np.maximum(np.bincount(of, minlength=bodies), 1)
+    return np.stack([np.bincount(of, weights=axis, minlength=bodies) / counts for axis in places.T], axis=1)
 
 
 def _check_triangles(given: ContactValues, surface: Primitives, thickness: float) -> None:

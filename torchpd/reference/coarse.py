@@ -233,6 +233,8 @@ def correct(
     pairs: PairContacts | None = None,
     *,
     motions: MotionsOf = RigidMotions,
+    push_pairs: bool = True,
+    passes: int = PASSES,
 ) -> Correction:
     """The coarse correction of every island.
 
@@ -242,34 +244,49 @@ def correct(
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
         motions: makes the motions of an island.
+        push_pairs: whether pairs push their vertices after the motion. An iteration with their multipliers does it, too.
+        passes: most states of an island with pairs at which Phi is looked at.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
     energies, pushes = np.full(int(problem.values.component.max()) + 1, np.inf), np.zeros_like(displacement)
-    for bodies, of in islands(problem, pairs):
+    for bodies, of in islands(problem, pairs, motions):
         own, moving = None if pairs is None or not len(of) else pairs.chosen(of), motions(problem, corrected, bodies)
         if not moving.modes.shape[2]:
             continue
-        corrected, push, each, energy = _correct_island(moving, forces, own)
+        most = PASSES if own is None else passes
+        corrected, push, each, energy = _correct_island(moving, forces, own, push_pairs, most)
         pushes = pushes + push
         after[of] = each[len(each) - len(of) :]
         energies[problem.values.component[[body[0] for body in bodies]]] = energy
     return Correction(corrected, after, energies, pushes)
 
 
-def islands(problem: Objective, pairs: PairContacts | None = None) -> Iterator[tuple[tuple[Index, ...], Index]]:
-    """The bodies of every island, as their vertices, and the numbers of its pairs."""
-    component = problem.values.component
+def islands(
+    problem: Objective, pairs: PairContacts | None = None, motions: MotionsOf = RigidMotions
+) -> Iterator[tuple[tuple[Index, ...], Index]]:
+    """The bodies of every island, as their vertices, and the numbers of its pairs.
+
+    Bodies that pins leave no motion are islands of their own, without pairs.
+    """
+    component, still = problem.values.component, np.zeros_like(problem.positions)
     ends = np.zeros((0, 2), np.int64) if pairs is None else component[pairs.vertices[:, [0, 3]]]
-    count = int(component.max()) + 1
-    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    of = [np.flatnonzero(component == body) for body in range(int(component.max()) + 1)]
+    # those of pairs alone: which other bodies move does not matter
+    moves = np.array([not (ends == n).any() or motions(problem, still, (body,)).modes.shape[2] > 0
+                      for n, body in enumerate(of)])
+    both = ends[moves[ends].all(axis=1)]
+    links = coo_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(len(of), len(of)))
     number = connected_components(links, directed=False)[1]
+    owner = np.where(moves[ends[:, 0]], number[ends[:, 0]], number[ends[:, 1]])
+    owner[~moves[ends].any(axis=1)] = -1
     for island in range(int(number.max()) + 1):
         members = np.flatnonzero(number == island)
-        bodies = tuple(np.flatnonzero(component == body) for body in members)
-        yield bodies, np.flatnonzero(number[ends[:, 0]] == island)
+        yield tuple(of[body] for body in members), np.flatnonzero(owner == island)
 
 
-def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None) -> tuple[Array, Array, Array, float]:
+def _correct_island(
+    motions: Motions, forces: Array, pairs: PairContacts | None, push_pairs: bool, passes: int
+) -> tuple[Array, Array, Array, float]:
     """Displacement and pushes [V, 3] m, forces [m, 3] N of all contacts and Phi [J] after the correction."""
     problem, vertices = motions.problem, np.concatenate(motions.bodies)
 
@@ -278,7 +295,7 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
 
     contacts = contacts_of(motions)
     radius = contacts.friction * contacts.normal_anchors
-    phi, moved, left = motions.energy + contacts.energy(radius), 0.0, PASSES - 1
+    phi, moved, left = motions.energy + contacts.energy(radius), 0.0, passes - 1
     while True:
         hessian, force = _newton_terms(motions, contacts, radius)
         # a line has no inertia about itself
@@ -317,7 +334,7 @@ def _correct_island(motions: Motions, forces: Array, pairs: PairContacts | None)
         else:
             break
         motions, contacts, phi, moved = trial, there, reached, moved + share * length
-    return *_pushed(motions, contacts, radius), contacts.forces(radius), phi
+    return *_pushed(motions, contacts, radius, push_pairs), contacts.forces(radius), phi
 
 
 def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
@@ -328,7 +345,7 @@ def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple
     return matrix, np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient
 
 
-def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
+def _pushed(motions: Motions, contacts: Envelopes, radius: Array, push_pairs: bool) -> tuple[Array, Array]:
     """Displacement [V, 3] m after the pushes w (f - f0) / D of all contacts and the projection, and these changes.
 
     A vertex that touches several planes and spheres is pushed by one after another.
@@ -337,7 +354,8 @@ def _pushed(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array
     several = len(problem.values.planes) + len(problem.values.spheres)
     rows = np.array_split(np.arange(several * len(motions.vertices)), max(several, 1))
     pushed = motions.displacement.copy()
-    for of in [*rows, np.arange(several * len(motions.vertices), len(contacts.gaps))]:
+    last = [np.arange(several * len(motions.vertices), len(contacts.gaps))] if push_pairs else []
+    for of in [*rows, *last]:
         each = contacts.chosen(of)
         way = (each.weights[:, :, None] * (pushed - motions.displacement)[each.vertices]).sum(axis=1)
         before = each.normal_anchors[:, None] * each.normals + each.tangent_anchors

@@ -32,7 +32,10 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class PairContacts:
-    """Contacts between bodies, given as a list: the gap is offset + n . sum_a w_a u_a."""
+    """Contacts between bodies, given as a list: the gap is offset + n . sum_a w_a u_a.
+
+    Vertices of rigid colliders are none of the problem: their weights are zero, and their part is in the last row.
+    """
 
     vertices: Index  # [m, 4]
     weights: Array  # [m, 4] they add up to zero
@@ -40,6 +43,7 @@ class PairContacts:
     offsets: Array  # [m] gap at u = 0, m
     friction: Array  # [m]
     forces: Array  # [m, 3] l n + t on the side of positive weights, N
+    carried: Array  # [m, 3] sum w u of vertices that are none of the problem, m
 
     def chosen(self, of: Index) -> PairContacts:
         """Some of the contacts."""
@@ -139,7 +143,7 @@ def contacts_at(
         moved = (pairs.weights[:, :, None] * displacement[pairs.vertices]).sum(axis=1)
         normals.append(pairs.normals)
         gaps.append(pairs.offsets + (pairs.normals * moved).sum(axis=1))
-        slips.append(moved)
+        slips.append(moved + pairs.carried)
         friction.append(pairs.friction)
         # contacts of one vertex repeat it with weight zero
         index = np.concatenate([np.repeat(index, 4, axis=1), pairs.vertices])

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..ops.fake_kernels import CONTACT_FRICTION
 from ..plan.contact_plan import ContactPlan, contact_plan
 from ..plan.contact_start import check_start
 from ..scene.contact import placed
 from ..scene.scene import SceneValues
+from .pair_forces import ContactSurfaces
 from .state import ContactHistory, HistoryState, State
 
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_GAP, _MISSING, _PINS_HELD_BACK, _UNBALANCED = 0, 1, 6, 7  # columns in csrc/contact/views.h
+_MISSING, _PINS_HELD_BACK, _UNBALANCED = 1, 2, 3  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 
 
@@ -41,6 +43,28 @@ class BodyContact:
     def to(self, dtype: torch.dtype, device: torch.device) -> BodyContact:
         """The same elsewhere, or in another precision, whose rounding must be below the thickness."""
         return BodyContact._made(self.plan, dtype, device)
+
+    @property
+    def friction(self) -> Tensor:
+        """Coulomb's coefficient between bodies [Q, Q]: those of the scene in its order, then colliders."""
+        return self.arrays[CONTACT_FRICTION]
+
+    def with_friction(self, friction: Tensor | float) -> BodyContact:
+        """The same with other coefficients, [] for all pairs or [Q, Q], through which gradients flow."""
+        old = self.friction
+        given = torch.as_tensor(friction, dtype=old.dtype, device=old.device)
+        fix = "set the values of sim.contact_friction, or a number for all pairs"
+        if given.shape not in ((), old.shape):
+            raise ValueError(f"contact_friction must be [] or {list(old.shape)}, got {list(given.shape)}; {fix}")
+        table = given.expand(old.shape).contiguous()
+        values = table.detach().double().cpu().numpy()
+        if not (np.isfinite(values).all() and (values >= 0.0).all()):
+            raise ValueError(f"contact_friction must be finite and >= 0, got {values.min():.6g} to {values.max():.6g}")
+        if not np.array_equal(values, values.T):
+            raise ValueError(f"contact_friction must be the same for (a, b) and (b, a), got another; {fix}")
+        arrays = list(self.arrays)
+        arrays[CONTACT_FRICTION] = table
+        return replace(self, plan=replace(self.plan, friction=values.copy()), arrays=arrays)
 
     @staticmethod
     def _made(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> BodyContact:
@@ -77,23 +101,35 @@ class BodyContact:
                 "the way of; leave it out"
             )
         self.check_transforms(state[0], state[1], *material)
-        _refuse_gradients(state, forces, poses, material)
+        if state[0].is_cuda:
+            _refuse_gradients(state, forces, poses, [*material, self.friction])
         before = ContactHistory(*state[2])  # type: ignore[misc]
-        history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.contiguous()]
+        history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.detach().contiguous()]
         wanted = history[0] if poses is None else poses.contiguous()
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
             state[0], state[1], forces, wanted, history, material, plan, self.arrays, **settings
         )
+        # reports, whose loss the op refuses
+        rows, numbers, held, pushes = (report.detach() for report in (rows, numbers, held, pushes))
         flow = before.flow
         if flow.shape[-2]:
             (after,) = _ops.next_history(positions, material, plan, time_step=settings["time_step"])
             # the step of an environment whose pairs exceed the capacity is taken back
             flow = torch.where((numbers[:, _MISSING] > 0)[:, None, None], flow, after)
-        held_back = torch.cat([numbers[:, _PINS_HELD_BACK, None], held.double()], dim=1).amax(dim=1)
-        own = torch.stack([numbers[:, _GAP], numbers[:, _MISSING], held_back], dim=1)
+        held_back = numbers[:, _PINS_HELD_BACK:_UNBALANCED]
+        if held.shape[1]:
+            held_back = torch.cat([held_back, held.double()], dim=1).amax(dim=1, keepdim=True)
         # the residual of other scenes would count forces between bodies as unbalanced
-        rows = torch.cat([numbers[:, _UNBALANCED, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
+        unbalanced, gaps = numbers[:, _UNBALANCED : _UNBALANCED + 1], numbers[:, :_PINS_HELD_BACK]
+        rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back], dim=1)
         return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
+
+    @property
+    def surfaces(self) -> ContactSurfaces:
+        """What forces between surfaces are read by."""
+        triangles, edges, _, body, collider = self.arrays[1:6]
+        points, cell, _, thickness = self.arrays[14:]
+        return ContactSurfaces(triangles, edges, body, collider, points, cell, thickness.to(points.device))
 
     @staticmethod
     def check_transforms(*given: Tensor) -> None:
@@ -137,7 +173,8 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     sizes = whole([len(plan.self_contact), len(plan.poses), plan.capacity])
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     trees = [plan.vertex_tree.order, plan.triangle_tree.order, plan.edge_tree.order]
-    reals = [plan.near.thickness, plan.points.reshape(-1, 3), plan.cell, plan.friction]
+    rest = [plan.near.thickness, plan.shape, plan.apart]
+    reals = [*rest, plan.points.reshape(-1, 3), plan.cell, plan.friction]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     moved = [array.to(device) for array in (*map(whole, [*surfaces, *trees]), keys, *map(real, reals))]
     return [sizes, *moved, real([plan.thickness])]
@@ -146,15 +183,16 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
 def _refuse_gradients(
     state: State | HistoryState, forces: Tensor | None, poses: Tensor | None, material: list[Tensor]
 ) -> None:
+    """Refuse inputs that require gradients, on a GPU."""
     if not torch.is_grad_enabled():
         return
     named = {"positions": state[0], "velocities": state[1], "forces": forces, "poses of colliders": poses}
-    named |= {f"history.{name}": array for name, array in zip(ContactHistory._fields, state[2], strict=True)}  # type: ignore[misc]
+    named["history.poses"] = state[2][0]  # type: ignore[misc]
     name = next((name for name, array in named.items() if array is not None and array.requires_grad), None)
     if name is None and any(array.requires_grad for array in material):
-        name = "material or targets"
+        name = "material, targets or friction"
     if name is not None:
         raise RuntimeError(
-            f"a step with Contact must not require gradients, got {name} that do; its derivative is not provided: "
-            "detach() them, or step under torch.no_grad()"
+            f"a step with Contact on a GPU must not require gradients, got {name} that do; its derivative is provided "
+            "on the CPU: step there, detach() them, or step under torch.no_grad()"
         )

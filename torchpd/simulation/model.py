@@ -270,6 +270,29 @@ class Model(nn.Module):
         self._reconfigure(adjoint=adjoint)
 
     @property
+    def contact_friction(self) -> Tensor:
+        """Coulomb's coefficient between bodies of `Contact` [Q, Q]: those of the scene in its order, then colliders.
+
+        Set a number, or a symmetric table; gradients of later steps flow to what was set. A table of its own for each
+        environment is not provided.
+
+        Example:
+            >>> friction = torch.tensor(0.3, requires_grad=True)
+            >>> sim.contact_friction = friction
+            >>> sim(state).positions.sum().backward()
+        """
+        return self._contact().friction
+
+    @contact_friction.setter
+    def contact_friction(self, friction: Tensor | float) -> None:
+        self.body_contact = self._contact().with_friction(friction)
+
+    def _contact(self) -> BodyContact:
+        if self.body_contact is None:
+            raise ValueError("contact_friction: the scene must have a Contact, got none; add Contact()")
+        return self.body_contact
+
+    @property
     def compiled(self) -> Configuration:
         """Plan, material and present settings, for modules below the simulator."""
         return self._with_material(self.material())

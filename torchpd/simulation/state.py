@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar, overload
 
 import torch
@@ -24,7 +24,9 @@ __all__ = [
     "State",
     "StepCall",
     "Track",
+    "chosen",
     "history_of",
+    "joined",
     "named_state",
 ]
 
@@ -134,6 +136,17 @@ def history_of(arrays: Iterable[Tensor]) -> History | ContactHistory:
     """A history with named parts, from its arrays in their order."""
     parts = tuple(arrays)
     return History(*parts) if len(parts) == len(History._fields) else ContactHistory(*parts)
+
+
+def chosen(state: _Some, environments: Sequence[int]) -> _Some:
+    """Some environments of a state, in this order."""
+    return _mapped(state, lambda tensor: tensor[environments])
+
+
+def joined(states: Sequence[_Some]) -> _Some:
+    """The environments of several states as one."""
+    others = [iter(_tensors_by_name(state).values()) for state in states]
+    return _mapped(states[0], lambda _: torch.cat([next(tensors) for tensors in others]))
 
 
 def _moved(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:

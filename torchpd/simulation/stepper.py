@@ -103,7 +103,8 @@ class Stepper(Readable):
 
         Gradients come from the implicit adjoint at the end of the step, with friction, and hold for all arguments but
         `start`. Their error follows that of the step: docs/limits.md#friction-and-gradients. Forward mode and
-        `torch.func.grad` are not provided, nor is any gradient in scenes with `Contact`.
+        `torch.func.grad` are not provided. With `Contact` poses have gradients too, forces of contact do not:
+        docs/contact.md#gradients.
 
         Args:
             state: positions and velocities [B, V, 3] [m, m/s]; with plastic solids or `Contact` a `HistoryState`.

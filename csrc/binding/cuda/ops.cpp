@@ -3,6 +3,7 @@
 
 #include "binding/contact_ops.h"
 #include "binding/plan_views.h"
+#include "cpu/adjoint/pair_views.h"
 #include "cuda/common/launch.h"
 #include "cuda/poisson/launch.h"
 
@@ -31,6 +32,14 @@ struct Cuda {
   using Field = Mixed<DeviceField<T>>;
   template <class T>
   using Conjugate = Mixed<DeviceConjugate<T>>;
+
+  template <class T>
+  static std::optional<LoadedPairs<T>> loaded_pairs(at::TensorList pairs, std::int64_t,
+                                                    std::int64_t) {
+    TORCH_CHECK_NOT_IMPLEMENTED(pairs.empty(),
+                                "conjugate_gradients takes pairs of surfaces on a CPU alone");
+    return {};
+  }
 
   template <class Call>
   static void view_stencils(Mixed<Call>& call, at::TensorList arrays, const Place& place) {

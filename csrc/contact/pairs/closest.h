@@ -31,7 +31,7 @@ PD_HD Vec3<T> combined(const T (&weight)[4], const Vec3<T> (&corner)[4]) {
 // part / whole within [0, 1]; 0 for an edge without length, and a NaN stays NaN.
 template <class T>
 PD_HD T unit_share(T part, T whole) {
-  const bool defined = whole > T(0);
+  const auto defined = whole > T(0);
   const T share = select(defined, part / select(defined, whole, T(1)), T(0));
   return select(share < T(0), T(0), select(share > T(1), T(1), share));
 }
@@ -39,13 +39,20 @@ PD_HD T unit_share(T part, T whole) {
 // The nearest to the origin among points of a triangle with corners `arm`; the first among equals.
 template <class T>
 struct NearestOfTriangle {
-  T weight[3] = {T(1), T(0), T(0)};
-  T square = T(HUGE_VAL);  // of its distance [m^2]
+  T weight[3], square;  // of its distance [m^2]
+
+  PD_HD NearestOfTriangle() : weight{T(1), T(0), T(0)}, square(T(HUGE_VAL)) {}
 
   PD_HD void consider(T a, T b, T c, const Vec3<T> (&arm)[3]) {
+    consider(a, b, c, arm, T(0) <= T(0));
+  }
+
+  // where `allowed`
+  template <class Mask>
+  PD_HD void consider(T a, T b, T c, const Vec3<T> (&arm)[3], const Mask& allowed) {
     const Vec3<T> place = multiply_add(c, arm[2], multiply_add(b, arm[1], a * arm[0]));
     const T own = dot(place, place);
-    const bool nearer = own < square;
+    const auto nearer = own < square && allowed;
     square = select(nearer, own, square);
     weight[0] = select(nearer, a, weight[0]);
     weight[1] = select(nearer, b, weight[1]);
@@ -78,8 +85,9 @@ PD_HD void vertex_triangle_weights(const Vec3<T> (&corner)[4], T (&weight)[4]) {
   const T area[3] = {dot(cross(arm[1], arm[2]), normal), dot(cross(arm[2], arm[0]), normal),
                      dot(cross(arm[0], arm[1]), normal)};
   const T sum = (area[0] + area[1]) + area[2];
-  if (area[0] >= none && area[1] >= none && area[2] >= none && sum > none)
-    nearest.consider(area[0] / sum, area[1] / sum, area[2] / sum, arm);
+  const auto inside = none <= area[0] && none <= area[1] && none <= area[2] && none < sum;
+  const T whole = select(inside, sum, one);
+  nearest.consider(area[0] / whole, area[1] / whole, area[2] / whole, arm, inside);
   weight[0] = one;
   weight[1] = -nearest.weight[0];
   weight[2] = -nearest.weight[1];
@@ -104,7 +112,7 @@ PD_HD void edge_edge_weights(const Vec3<T> (&corner)[4], T (&weight)[4]) {
   const auto consider = [&](T own_s, T own_t) {
     const Vec3<T> between = subtract_product(multiply_add(own_s, p, r), own_t, q);
     const T square = dot(between, between);
-    const bool nearer = square < least;
+    const auto nearer = square < least;
     least = select(nearer, square, least);
     s = select(nearer, own_s, s);
     t = select(nearer, own_t, t);

@@ -26,7 +26,7 @@ struct Multiplier {
 template <class T>
 PD_HD Vec3<T> onto_disc(const Vec3<T>& vector, T radius) {
   const T length = square_root(dot(vector, vector));
-  const bool outside = length > radius;
+  const auto outside = length > radius;
   return select(outside, radius / select(outside, length, T(1)), T(1)) * vector;
 }
 

@@ -11,7 +11,7 @@
 namespace pd::inline PD_TARGET {
 
 constexpr double floor_share = 0.1;   // least distance of the promise over the thickness
-constexpr int contact_sweeps = 4;     // of multipliers in an iteration
+constexpr int contact_sweeps = 8;     // in an iteration: with 4 an edge on an edge cycles
 constexpr int search_pause = 5;       // least iterations between searches
 constexpr double ball_reach = 1.2;    // of what a vertex wants; see ball_cells
 constexpr double ball_room = 0.49;    // of the room to the nearest other side
@@ -60,6 +60,11 @@ struct ContactPair {
     for (int a = 0; a < 4; ++a)
       if (inverse[vertex[a]] > T(0)) sum = sum + absolute(near.weight[a]);
     return sum;
+  }
+
+  template <class Inverse>
+  PD_HD bool can_yield(const Inverse& inverse) const {
+    return freedom(inverse) > T(least_yield);
   }
 
   PD_HD Vec3<T> normal_at(const Closest<T>& at) const {

@@ -11,10 +11,10 @@ constexpr int share_halvings = 30;  // of the interval of a share
 
 // The largest share in [0, 1] that is allowed, if 0 is, and with it all smaller ones.
 template <class T, class Allowed>
-PD_HD T largest_share(const Allowed& allowed) {
+PD_HD T largest_share(const Allowed& allowed, int halvings = share_halvings) {
   if (allowed(T(1))) return T(1);
   T least(0), most(1);
-  for (int n = 0; n < share_halvings; ++n) {
+  for (int n = 0; n < halvings; ++n) {
     const T middle = T(0.5) * (least + most);
     (allowed(middle) ? least : most) = middle;
   }
@@ -26,6 +26,12 @@ template <class T>
 struct Hand {
   Pose<T> pose, goal;  // the actual one, and that of the step's end
   int begin, end;      // vertices
+
+  PD_HD bool is_there() const {
+    const Vec3<T> way = goal.origin - pose.origin, turn = goal.axis - pose.axis;
+    return way.x == T(0) && way.y == T(0) && way.z == T(0) && turn.x == T(0) && turn.y == T(0) &&
+           turn.z == T(0) && goal.w == pose.w;
+  }
 
   PD_HD static Pose<T> read(const T* p) { return {{p[0], p[1], p[2]}, p[3], {p[4], p[5], p[6]}}; }
   PD_HD static void write(const Pose<T>& pose, T* p) {

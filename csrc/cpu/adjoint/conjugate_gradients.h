@@ -1,5 +1,6 @@
 // Runner of solver/adjoint/conjugate_gradients.h: one environment at a time, by one thread or by a team.
 #pragma once
+#include "cpu/adjoint/pairs.h"
 #include "cpu/adjoint/rotation_jacobians.h"
 #include "cpu/multilevel/v_cycle.h"
 #include "cpu/step/sweep.h"
@@ -12,52 +13,60 @@
 namespace pd::inline PD_TARGET {
 
 // Vectors of BiCGStab: p, the first residual of a cycle, the correction of y, and the second product of an iteration.
+// Pairs of surfaces take two more: the vector that a product is of, slanted, and the product.
 template <class T>
 struct FrictionVectors {
-  Quad<T>*search, *shadow, *correction, *smoothed;  // [vertices]
+  Quad<T>*search, *shadow, *correction, *smoothed, *slanted, *product;  // [vertices]
 
-  explicit FrictionVectors(std::int64_t vertices)
-      : storage_(allocate_zeroed(4 * vertices * sizeof(Quad<T>))) {
+  FrictionVectors(std::int64_t vertices, bool pairs)
+      : storage_(allocate_zeroed((pairs ? 6 : 4) * vertices * sizeof(Quad<T>))) {
     search = reinterpret_cast<Quad<T>*>(storage_.get());
     shadow = search + vertices;
     correction = shadow + vertices;
     smoothed = correction + vertices;
+    slanted = smoothed + vertices;
+    product = slanted + vertices;
   }
 
  private:
   Storage storage_;
 };
 
-// Memory of one environment's solve, shared by a team.
-template <class T>
+// Memory of one environment's solve, shared by a team. `HasPairs`: with contact between bodies, by one thread.
+template <class T, bool HasPairs>
 struct ConjugateMemory {
   Workspace<Single<T>> vectors;
   RotationJacobians<T> jacobians;
   std::unique_ptr<Cycle<Single<T>>> cycle;  // null without levels
   FrictionVectors<T> friction;
+  std::unique_ptr<AdjointPairs<T>> pairs;  // null without pairs
 
   explicit ConjugateMemory(const ConjugateCall<T>& call)
       : vectors(call),
         jacobians(call.plan, call.effects.poisson.data != nullptr),
-        friction(call.friction ? call.plan.vertices : 0) {
+        friction(call.friction ? call.plan.vertices : 0, HasPairs) {
+    if constexpr (HasPairs)
+      pairs = std::make_unique<AdjointPairs<T>>(*call.pairs, call.plan.vertex_order,
+                                                call.plan.vertices);
     if (call.plan.levels.there()) cycle = std::make_unique<Cycle<Single<T>>>(call.plan.levels);
   }
 };
 
-template <class T>
+template <class T, bool HasPairs = false>
 class ConjugatePass {
   using Lanes = Single<T>;
   using Sum = Sums<Lanes>;
 
  public:
-  ConjugatePass(const ConjugateCall<T>& call, ConjugateMemory<T>& work, Scratch<Lanes>& scratch,
-                const Team& team)
+  ConjugatePass(const ConjugateCall<T>& call, ConjugateMemory<T, HasPairs>& work,
+                Scratch<Lanes>& scratch, const Team& team)
       : call_(call),
         plan_(call.plan),
         w_(work.vectors),
         jacobians_(work.jacobians),
         cycle_(work.cycle.get()),
         f_(work.friction),
+        pairs_(work.pairs.get()),
         team_(team),
         sweep_{plan_, w_, scratch, team} {}
 
@@ -118,9 +127,18 @@ class ConjugatePass {
     }
     sweep_.run(0, Elements{KeepJacobians<T>{jacobians_}, NoStencils{}},
                [](std::int64_t, const Quad<T>&, Sum&) {});
+    if constexpr (HasPairs)
+      pairs_->read(
+          environment_, [&](int i) -> T& { return w_.inverse[i]; },
+          [&](int i) { return projector(i); }, [&](int i) { return sliding(i); });
   }
 
   void begin(Conjugate& numbers) {
+    double whole = 0;
+    if constexpr (HasPairs) {
+      whole = square(residual());
+      leave_pairs(residual());
+    }
     const double weighted = cycle_ ? apply_levels() : 0;
     each_part([&](std::int64_t i, Sum& sums) {
       const Quad<T> right = residual()[i];
@@ -132,6 +150,11 @@ class ConjugatePass {
     });
     const auto sum = total(1);
     numbers.begin(sum.first, cycle_ ? weighted : sum.second);
+    // the pairs may take all of it but rounding: errors are relative to what was there before
+    if (HasPairs && numbers.active) {
+      numbers.scale = std::sqrt(whole);
+      numbers.check_residual(sum.first, call_.tolerance);
+    }
     team_.barrier();  // before the next sums stand there
   }
 
@@ -149,7 +172,14 @@ class ConjugatePass {
       image()[i] = Lanes::value(moved);
       sums.first = multiply_add(d, image()[i], sums.first);
     });
-    const T step = T(numbers.step(total(0).first));
+    if constexpr (HasPairs) {
+      add_pairs(true, direction(), image());
+      leave_pairs(image());
+      each_part([&](std::int64_t i, Sum& sums) {
+        sums.first = multiply_add(direction()[i], image()[i], sums.first);
+      });
+    }
+    const T step = T(numbers.step(total(HasPairs ? 1 : 0).first));
     if (!numbers.active) return;
     each_part([&](std::int64_t i, Sum& sums) {
       solution()[i] = multiply_add(step, direction()[i], solution()[i]);
@@ -170,8 +200,8 @@ class ConjugatePass {
 
   // Continues with BiCGStab where vertices slide, after so many products; returns whether it has.
   bool solve_friction(const Conjugate& numbers, int products) {
-    if (!call_.friction || !continues_with_friction(numbers, call_.tolerance) || !some_slide())
-      return false;
+    if (!call_.friction || !continues_with_friction(numbers, call_.tolerance)) return false;
+    if (!some_slide() && !(HasPairs && pairs_->some())) return false;
     FrictionSolve friction(nullptr, numbers.scale);
     friction.begin(products, adjoint_iterations);
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
@@ -183,6 +213,7 @@ class ConjugatePass {
 
   // every thread checks for itself
   bool some_slide() const {
+    if (!call_.sliding) return false;
     for (std::int64_t i = 0; i < plan_.vertices; ++i) {
       if (slides(sliding(i))) return true;
     }
@@ -198,15 +229,14 @@ class ConjugatePass {
       if (cycle_) return cycle_->result()[i];
       return w_.inverse[i] * (stage == FrictionStage::first ? f_.search : residual())[i];
     };
+    if constexpr (HasPairs) slant(z);
+    const auto moved = [&](std::int64_t i) { return HasPairs ? f_.slanted[i] : z(i); };
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
-      direction()[i] = Lanes::value(transposed_friction(to_vec3(z(i)), sliding(i)));
+      direction()[i] = against_friction(moved(i), i);
     team_.barrier();
-    multiply([&](std::int64_t i, const Quad<T>& force, Sum& sums) {
-      const Quad<T> product =
-          Lanes::value(friction_image(to_vec3(force), to_vec3(z(i)), w_.inertia[i],
-                                      w_.inverse[i] != T(0), projector(i), sliding(i)));
+    const auto record = [&](std::int64_t i, const Quad<T>& product, Sum& sums) {
       if (stage == FrictionStage::residual) {
-        const Quad<T> rest = (T(1) / unit_) * read(call_.right, i) - product;
+        const Quad<T> rest = HasPairs ? product : (T(1) / unit_) * read(call_.right, i) - product;
         residual()[i] = rest;
         sums.first = multiply_add(rest, rest, sums.first);
       } else if (stage == FrictionStage::first) {
@@ -217,8 +247,23 @@ class ConjugatePass {
         sums.first = multiply_add(product, residual()[i], sums.first);
         sums.second = multiply_add(product, product, sums.second);
       }
+    };
+    multiply([&](std::int64_t i, const Quad<T>& force, Sum& sums) {
+      const Quad<T> product = image_with_friction(i, force, moved(i));
+      if constexpr (HasPairs) {
+        f_.product[i] = product;
+      } else {
+        record(i, product, sums);
+      }
     });
-    const auto sum = total(0);
+    if constexpr (HasPairs) {
+      add_pairs(false, direction(), f_.product);
+      for (std::int64_t i = 0; stage == FrictionStage::residual && i < plan_.vertices; ++i)
+        f_.product[i] = (T(1) / unit_) * read(call_.right, i) - f_.product[i];
+      leave_pairs(f_.product);
+      each_part([&](std::int64_t i, Sum& sums) { record(i, f_.product[i], sums); });
+    }
+    const auto sum = total(HasPairs ? 1 : 0);
     if (stage == FrictionStage::residual) return correct(friction, sum.first);
     const bool first = stage == FrictionStage::first;
     const T step =
@@ -239,6 +284,64 @@ class ConjugatePass {
       f_.search[i] =
           multiply_add(keep, subtract_product(f_.search[i], step, image()[i]), residual()[i]);
     team_.barrier();
+  }
+
+  Quad<T> image_with_friction(std::int64_t i, const Quad<T>& force, const Quad<T>& z) const {
+    const bool moves = w_.inverse[i] != T(0);
+    if (!call_.sliding)
+      return Lanes::value(conjugate_image<T>(to_vec3(force), to_vec3(z), w_.inertia[i], moves,
+                                             projector(i), nullptr));
+    return Lanes::value(
+        friction_image(to_vec3(force), to_vec3(z), w_.inertia[i], moves, projector(i), sliding(i)));
+  }
+
+  // l of a vertex without pairs: moves along its plane go with moves off it, where friction acts.
+  Quad<T> against_friction(const Quad<T>& z, std::int64_t i) const {
+    const T* of = sliding(i);
+    return of ? Lanes::value(transposed_friction(to_vec3(z), of)) : z;
+  }
+
+  // ---- pairs of surfaces
+
+  static Vec3<double> in_double(const Quad<T>& a) {
+    return {double(a.q.v[0]), double(a.q.v[1]), double(a.q.v[2])};
+  }
+  static Quad<T> plus(const Quad<T>& a, const Vec3<double>& b) {
+    return to_quad(T(double(a.q.v[0]) + b.x), T(double(a.q.v[1]) + b.y), T(double(a.q.v[2]) + b.z));
+  }
+
+  // The part of a field that no pair takes.
+  void leave_pairs(Quad<T>* field) {
+    pairs_->rows().project([&](int i) { return in_double(field[i]); },
+                           [&](int i, const Vec3<double>& a) { field[i] = plus(field[i], a); });
+  }
+
+  double square(const Quad<T>* field) const {
+    double sum = 0;
+    for (std::int64_t i = 0; i < plan_.vertices; ++i) {
+      const Vec3<double> a = in_double(field[i]);
+      sum += dot(a, a);
+    }
+    return sum;
+  }
+
+  // Adds what the pairs have of the matrix, transposed or by its positive part, times a field.
+  void add_pairs(bool positive, const Quad<T>* field, Quad<T>* to) {
+    pairs_->multiply(
+        positive, [&](int i) { return in_double(field[i]); },
+        [&](int i, const Vec3<double>& a) {
+          const Vec3<T> free = project(Vec3<T>{T(a.x), T(a.y), T(a.z)}, projector(i));
+          to[i] = to[i] + Lanes::value(free);
+        });
+  }
+
+  // Moves of z that the forces of all pairs do not resist.
+  template <class Z>
+  void slant(const Z& z) {
+    for (std::int64_t i = 0; i < plan_.vertices; ++i) f_.slanted[i] = z(i);
+    pairs_->rows().slant(
+        [&](int i) { return in_double(z(i)); },
+        [&](int i, const Vec3<double>& a) { f_.slanted[i] = plus(f_.slanted[i], a); });
   }
 
   // Takes the |r|^2 of the true residual of y with its correction: begins a cycle, or ends.
@@ -299,9 +402,12 @@ class ConjugatePass {
 
   // `slides`: the multiplier is G^T times the solution
   void store(bool slides) {
+    if (HasPairs && slides) {
+      slant([&](std::int64_t i) { return solution()[i]; });
+      std::copy_n(f_.slanted, plan_.vertices, solution());
+    }
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {
-      if (slides)
-        solution()[i] = Lanes::value(transposed_friction(to_vec3(solution()[i]), sliding(i)));
+      if (slides) solution()[i] = against_friction(solution()[i], i);
       write(call_.solution, i, unit_ * solution()[i]);
       write(call_.residual, i, unit_ * residual()[i]);
       write(call_.direction, i, unit_ * direction()[i]);
@@ -351,6 +457,7 @@ class ConjugatePass {
   RotationJacobians<T>& jacobians_;
   const Cycle<Lanes>* cycle_;
   FrictionVectors<T>& f_;
+  AdjointPairs<T>* pairs_;
   const Team& team_;
   Sweep<Lanes> sweep_;
   std::int64_t environment_ = 0;

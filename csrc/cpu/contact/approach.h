@@ -108,18 +108,30 @@ class Approach {
       const Vec3<T> rest = target[v] - place[v] - narrow(rigid_[plan_.body[v]].at(wide(place[v])));
       reach[v] = square_root(dot(rest, rest));
     }
-    for (int b = 0; b < plan_.bodies; ++b) own_[b] = rigid_[b].mass > 0;
-    run.search().each_boxed(
+    const T none(0);
+    std::vector<char> searches(plan_.bodies, 0);
+    for (int b = 0; b < plan_.bodies; ++b) {
+      own_[b] = rigid_[b].mass > 0;
+      if (!own_[b] || !plan_.touches_itself[b]) continue;
+      T most(0);
+      run.near().shapes().each_of(b, [&](int v) { most = reach[v] > most ? reach[v] : most; });
+      const T room = run.near().shapes().apart(b, place) - T(1.0 + slack_share) * plan_.thickness;
+      searches[b] = !(T(2) * most <= room);
+    }
+    if (std::none_of(searches.begin(), searches.end(), [](char s) { return s; })) return;
+    run.near().each_meeting(
         [&](int v) { return Box<T>{place[v], place[v]}; },
         [&](int v) { return reach[v] + T(0.5) * plan_.thickness; },
-        [&](int v) { return run.moves_by_hand(v); },
-        [&](const ContactPair<T>& pair) {
-          const int b = plan_.body[pair.vertex[0]];
-          if (b != plan_.body[pair.vertex[3]] || !own_[b]) return;
+        [&](int b) { return searches[b] != 0; }, [](int, int) { return false; },
+        [&](const PairSides& sides) {
+          const T thickness = run.near().search().thickness_of(sides);
+          if (!own_[plan_.body[sides.vertex[0]]] || !(thickness > none)) return;
+          const ContactPair<T> pair = run.near().search().pair_of(sides, thickness);
           Vec3<T> start[4], end[4];
           pair.corners(place, start);
           pair.corners(target, end);
-          own_[b] = stays_apart(pair, start, end, [&](int v) { return reach[v]; }, plan_.thickness);
+          own_[plan_.body[pair.vertex[0]]] =
+              stays_apart(pair, start, end, [&](int v) { return reach[v]; }, plan_.thickness);
         });
   }
 
@@ -147,27 +159,14 @@ class Approach {
       const T bow = v < plan_.body_vertices ? T(0) : T(0.5) * square_root(dot(chord, chord));
       return bow + T(0.5) * plan_.thickness;
     };
-    if (!some_bodies_meet(swept, reach)) return;
-    run.search().each_boxed(
-        swept, reach, [&](int v) { return run.moves_by_hand(v); },
-        [&](ContactPair<T>& pair) {
-          if (plan_.body[pair.vertex[0]] != plan_.body[pair.vertex[3]]) visit(pair);
+    run.near().each_meeting(
+        swept, reach, [](int) { return false; }, [](int, int) { return true; },
+        [&](const PairSides& sides) {
+          const T thickness = run.near().search().thickness_of(sides);
+          if (!(thickness > T(0))) return;
+          ContactPair<T> pair = run.near().search().pair_of(sides, thickness);
+          visit(pair);
         });
-  }
-
-  // Whether the swept boxes of any two bodies meet.
-  template <class Swept, class Reach>
-  bool some_bodies_meet(const Swept& swept, const Reach& reach) {
-    boxes_.assign(plan_.bodies, Box<T>::none());
-    for (int n = 0; n < plan_.points; ++n) {
-      const int v = plan_.point[n];
-      boxes_[plan_.body[v]].add(swept(v).widened(reach(v)));
-    }
-    for (int a = 0; a < plan_.bodies; ++a) {
-      for (int b = a + 1; b < plan_.bodies; ++b)
-        if (boxes_[a].meets(boxes_[b])) return true;
-    }
-    return false;
   }
 
   // Groups of moving bodies that pairs couple: each goes by one share.
@@ -234,6 +233,8 @@ class Approach {
 
   template <class Walls>
   void go_alone(ContactRun<T>& run, const Walls& walls) {
+    const auto arrived = [](T share) { return share >= T(1); };
+    if (std::all_of(together_.begin(), together_.end(), arrived)) return;
     const Places& place = run.place();
     list_.pairs.clear();
     each_between(run, [&](ContactPair<T>& pair) {
@@ -278,7 +279,6 @@ class Approach {
   std::vector<Screw<T>> screws_;  // of colliders
   std::vector<T> together_, alone_;
   std::vector<int> group_;
-  std::vector<Box<T>> boxes_;  // of bodies
   Places way_, end_, start_;
   std::vector<RigidWay> rigid_;
   std::vector<char> own_, pinned_;

@@ -4,7 +4,8 @@
 // contact/pairs/half_space.h. Planes that the next iterate violates are made anew at the present one before.
 #pragma once
 #include "contact/pairs/shares.h"
-#include "cpu/contact/pairs.h"
+#include "cpu/contact/active.h"
+#include "cpu/contact/near.h"
 
 #include <cmath>
 
@@ -16,16 +17,19 @@ class ContactRun {
   using Places = std::vector<Vec3<T>>;
 
   explicit ContactRun(const ContactPlan<T>& plan)
-      : plan_(plan), search_(plan), held_(plan.vertices), inverse_(plan.vertices) {
+      : plan_(plan),
+        held_(plan.vertices),
+        near_(plan, held_),
+        sweeps_(plan),
+        inverse_(plan.vertices) {
     for (Places* places : {&begin_, &place_, &target_, &goal_, &shift_})
       places->resize(plan.vertices);
-    is_surface_.assign(plan.vertices, 0);
-    for (int n = 0; n < plan.points; ++n) is_surface_[plan.point[n]] = 1;
     for (int v = plan.body_vertices; v < plan.vertices; ++v) {
       if (hands_.size() <= std::size_t(plan.collider[v])) hands_.push_back({{}, {}, v, v});
       hands_.back().end = v + 1;
     }
     balls_.resize(plan.vertices);
+    limits_.resize(plan.vertices, Limits::none);
   }
 
   const ContactPlan<T>& plan() const { return plan_; }
@@ -33,6 +37,7 @@ class ContactRun {
   Places& target() { return target_; }            // of the next one, before contact
   Places& goal() { return goal_; }                // of what moves by hand
   std::vector<T>& inverse() { return inverse_; }  // 1 / D; 0 for what moves by hand
+  const Places& begin_places() const { return begin_; }  // at the step's start
   const PairList<T>& list() const { return list_; }
   bool moves_by_hand(int vertex) const { return held_[vertex] != 0; }
   bool was_cut(int vertex) const { return cut_[vertex] != 0; }
@@ -54,6 +59,7 @@ class ContactRun {
       }
     }
     for (int v = 0; v < plan_.vertices; ++v) held_[v] = !(inverse_[v] > T(0));
+    near_.begin();
     begin_ = place_;
     known_.clear();
     for (int n = 0; n < plan_.capacity && keys[n] >= 0; ++n) {
@@ -66,45 +72,15 @@ class ContactRun {
     waits_ = checked_ = false;
   }
 
-  // Lists the pairs that may come near while no vertex leaves its ball. A ball reaches over what its vertex wants and the
-  // thickness. Where that is less than half of the room to the nearest other side, it takes that: no pair more is listed.
+  // Lists the pairs that may come near, with planes, and the forces that are known of them.
   void find() {
-    const auto most = [&](int v) { return T(ball_cells) * plan_.cell[v]; };
-    near_.clear();
-    room_.assign(plan_.vertices, T(HUGE_VAL));
-    search_.each_boxed([&](int v) { return Box<T>{place_[v], place_[v]}; },
-                       [&](int v) { return most(v) + T(0.5) * plan_.thickness; },
-                       [&](int v) { return moves_by_hand(v); },
-                       [&](ContactPair<T>& pair) {
-                         Vec3<T> corner[4];
-                         pair.corners(place_, corner);
-                         pair.near = closest_points(pair.edges, corner);
-                         if (!pair.is_within(most, plan_.thickness)) return;
-                         for (int v : pair.vertex)
-                           room_[v] = std::min(room_[v], pair.near.distance);
-                         near_.push_back(pair);
-                       });
-    for (int v = 0; v < plan_.vertices; ++v) {
-      const Vec3<T> way = target_[v] - place_[v];
-      const T wanted =
-          T(ball_reach) * square_root(dot(way, way)) + (held_[v] ? T(0) : plan_.thickness);
-      const T roomy = held_[v] ? T(0) : T(ball_room) * (room_[v] - plan_.thickness);
-      radius(v) = std::min(std::max(wanted, roomy), most(v));
-      balls_[v].center = place_[v];
-    }
-    list_.pairs.clear();
-    for (ContactPair<T>& pair : near_) {
-      if (!pair.is_within([&](int v) { return balls_[v].radius; }, plan_.thickness)) continue;
-      make_plane(pair, place_, target_, pair.near, Vec3<T>{});
-      list_.pairs.push_back(pair);
-    }
-    // inside bodies nothing meets
-    for (int v = 0; v < plan_.vertices; ++v)
-      if (!is_surface_[v]) radius(v) = T(HUGE_VAL);
+    near_.find(place_, target_, balls_, list_.pairs);
     most_pairs = std::max(most_pairs, std::int64_t(list_.pairs.size()));
     ++searches;
     if (overflows()) list_.pairs.clear();
     list_.index(plan_.vertices);
+    std::fill(limits_.begin(), limits_.end(), Limits::none);
+    for (ContactPair<T>& pair : list_.pairs) renew_plane(pair, target_, Vec3<T>{});
     look();
     for (ContactPair<T>& pair : list_.pairs) {
       const auto at =
@@ -117,12 +93,15 @@ class ContactRun {
 
   // Closest points and normals of all pairs at the present iterate.
   void look() {
-    for (ContactPair<T>& pair : list_.pairs) {
-      Vec3<T> corner[4];
-      pair.corners(place_, corner);
-      pair.near = closest_points(pair.edges, corner);
-      pair.normal = pair.normal_at(pair.near);
-    }
+    list_.each_kind([&](bool edges, int first, int count) {
+      each_closest<T>(
+          edges, count, [&](int n) -> const auto& { return list_.pairs[first + n]; }, place_,
+          [&](int n, const Closest<T>& near) {
+            ContactPair<T>& pair = list_.pairs[first + n];
+            pair.near = near;
+            pair.normal = pair.normal_at(near);
+          });
+    });
   }
 
   // E + psi at the last check and now, both by the list and the multipliers of now.
@@ -132,18 +111,20 @@ class ContactRun {
   };
   Merits check(double energy) {
     Merits merits{checked_energy_, energy, checked_};
-    for (const ContactPair<T>& pair : list_.pairs) {
-      const T yielding = pair.yielding(inverse_);
-      const auto psi = [&](const Places& places, const Closest<T>& at) {
-        return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction,
-                                    at.distance, pair.slip(places, begin_, at));
-      };
-      if (checked_) {
-        Vec3<T> corner[4];
-        pair.corners(checked_place_, corner);
-        merits.before += psi(checked_place_, closest_points(pair.edges, corner));
-      }
-      merits.now += psi(place_, pair.near);
+    const auto add = [&](double& sum, const ContactPair<T>& pair, const Places& places,
+                         const Closest<T>& at) {
+      if (!(pair.force.normal > T(0)) && !(at.distance < pair.thickness)) return;  // psi is 0
+      sum += augmented_lagrangian(pair.force, pair.yielding(inverse_), pair.thickness,
+                                  pair.friction, at.distance, pair.slip(places, begin_, at));
+    };
+    for (const ContactPair<T>& pair : list_.pairs) add(merits.now, pair, place_, pair.near);
+    if (checked_) {
+      list_.each_kind([&](bool edges, int first, int count) {
+        const auto pair_at = [&](int n) -> const auto& { return list_.pairs[first + n]; };
+        each_closest<T>(edges, count, pair_at, checked_place_, [&](int n, const Closest<T>& near) {
+          add(merits.before, pair_at(n), checked_place_, near);
+        });
+      });
     }
     checked_energy_ = energy;
     checked_place_ = place_;
@@ -151,56 +132,77 @@ class ContactRun {
     return merits;
   }
 
-  // The proximal step: multipliers in the metric of D, and what they move. c = theta omega.
-  void prox(T c) {
-    active_.clear();
-    for (int p = 0; p < int(list_.pairs.size()); ++p) {
-      ContactPair<T>& pair = list_.pairs[p];
-      if (!(pair.freedom(inverse_) > T(least_yield))) {
-        pair.force = {};  // nothing can yield
-        continue;
+  // After a coarse correction: forces of a pair; the last check says nothing more.
+  void set_force(int pair, const Multiplier<T>& force) { list_.pairs[pair].force = force; }
+  void forget_check() { checked_ = false; }
+
+  bool leaves_ball(int v, const Vec3<T>& place) const { return !is_inside(v, place); }
+
+  // Planes that `to` violates are made anew at the present iterate.
+  void refresh(const Places& to) {
+    std::fill(limits_.begin(), limits_.end(), Limits::none);
+    list_.each_kind([&](bool edges, int first, int count) {
+      constexpr int W = native_width<T>;
+      using P = Pack<T, W>;
+      for (int begin = 0; begin < count; begin += W) {
+        const int some = std::min(W, count - begin);
+        const auto pair_at = [&](int lane) -> const auto& {
+          return list_.pairs[first + begin + lane];
+        };
+        Vec3<P> corner[4];
+        gather_corners<T, W>(pair_at, some, to, corner);
+        T number[5][W];
+        bool frozen = false;
+        for (int lane = 0; lane < W; ++lane) {
+          const PairPlane<T>& plane = pair_at(lane < some ? lane : some - 1).plane;
+          number[0][lane] = plane.normal.x, number[1][lane] = plane.normal.y;
+          number[2][lane] = plane.normal.z;
+          number[3][lane] = plane.above, number[4][lane] = plane.below;
+          frozen = frozen || plane.frozen;
+        }
+        const Vec3<P> normal{P::load(number[0]), P::load(number[1]), P::load(number[2])};
+        const P above = P::load(number[3]), below = P::load(number[4]);
+        P least{T(HUGE_VAL)};  // of the slacks
+        for (int a = 0; a < 4; ++a) {
+          const P height = dot(normal, corner[a]);
+          least = lesser(least, a <= (edges ? 1 : 0) ? height - above : below - height);
+        }
+        const auto broken = least < P{T(0)};
+        if (!frozen && !any(broken)) continue;
+        for (int lane = 0; lane < some; ++lane) {
+          ContactPair<T>& pair = list_.pairs[first + begin + lane];
+          if (broken.m[lane] || pair.plane.frozen) renew_plane(pair, to, pair.plane.normal);
+        }
       }
-      Vec3<T> corner[4];
-      pair.corners(target_, corner);
-      const bool touches = dot(pair.normal, combined(pair.near.weight, corner)) < pair.thickness;
-      if (touches || pair.force.normal > T(0)) active_.push_back(p);
-    }
-    if (active_.empty()) return;
-    weights_.assign(plan_.vertices, T(0));
-    for (int p : active_) {
-      const ContactPair<T>& pair = list_.pairs[p];
-      for (int a = 0; a < 4; ++a)
-        weights_[pair.vertex[a]] = weights_[pair.vertex[a]] + absolute(pair.near.weight[a]);
-    }
-    for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
-      push(c);
-      for (int p : active_) {
-        ContactPair<T>& pair = list_.pairs[p];
-        const T sum = row_bound(pair, weights_, inverse_);
-        Vec3<T> between[4], before[4];
-        pair.corners(shift_, between);
-        pair.corners(begin_, before);
-        pair.force =
-            advance(pair.force, T(1) / (c * sum), pair.thickness, pair.friction, pair.normal,
-                    combined(pair.near.weight, between), combined(pair.near.weight, before));
-      }
-    }
-    push(c);
-    for (int p : active_)
-      for (int v : list_.pairs[p].vertex) target_[v] = shift_[v];
+    });
   }
 
-  // Goes as near to the targets as the promise allows. `walls(vertex, visit)`: half-spaces of the scene.
+  // The proximal step: multipliers in the metric of D, and what they move. c = theta omega.
+  void prox(T c) { sweeps_.run(list_, begin_, inverse_, c, target_); }
+
+  // Goes as near to the targets as the promise allows. `walls(vertex, visit)`: half-spaces of the scene. Only planes that
+  // are new since the last move may cut a way: `refresh` has compared the targets with the others.
   template <class Walls>
   void move(const Walls& walls) {
     cut_.assign(plan_.vertices, 0);
     cut_any_ = false;
-    shift_ = place_;
     for (int v = 0; v < plan_.vertices; ++v) {
-      if (held_[v]) continue;
-      if (list_.is_stuck(v)) {
+      if (held_[v]) {
+        shift_[v] = place_[v];
+        continue;
+      }
+      if (limits_[v] == Limits::stuck) {
+        shift_[v] = place_[v];
         cut(v);
         ++frozen;
+        continue;
+      }
+      bool is_free = limits_[v] == Limits::none && is_inside(v, target_[v]);
+      each_wall(v, walls, [&](const Vec3<T>& normal, T bound, T) {
+        is_free = is_free && !(dot(normal, target_[v]) - bound < T(0));
+      });
+      if (is_free) {
+        shift_[v] = target_[v];
         continue;
       }
       const LimitedPlace<T> to = limit(target_[v], place_[v], balls_[v],
@@ -215,17 +217,13 @@ class ContactRun {
   // Before the move of iteration k: a search if a vertex wants to leave its ball, else planes that targets violate are made
   // anew at the present iterate. Searches pause while pairs have forces.
   void prepare(int k) {
-    remember();
-    bool outside = false, loaded = false;
-    for (int v = 0; v < plan_.vertices && !outside; ++v) {
-      Vec3<T> target = target_[v];
-      outside = move_into(balls_[v], target);
-    }
-    for (const ContactPair<T>& pair : list_.pairs) loaded = loaded || pair.force.normal != T(0);
-    const bool due = k - searched_at_ >= search_pause || !loaded;
+    bool outside = false;
+    for (int v = 0; v < plan_.vertices && !outside; ++v) outside = !is_inside(v, target_[v]);
+    const bool due = outside && (k - searched_at_ >= search_pause || !list_.is_loaded());
     waits_ = outside && !due;
-    if (!outside || !due) return refresh();
+    if (!due) return refresh(target_);
     searched_at_ = k;
+    remember();
     find();
   }
 
@@ -245,7 +243,7 @@ class ContactRun {
   // calls visit(vertex) for vertices of pairs between bodies with a force that is known, one of each side
   template <class Visit>
   void each_known(const Visit& visit) const {
-    const std::int64_t first_edge = first_edge_key(plan_);
+    const std::int64_t first_edge = std::int64_t(plan_.vertices) * plan_.triangles;
     for (const Known& known : known_) {
       const bool edges = known.key >= first_edge;
       const std::int64_t key = edges ? known.key - first_edge : known.key,
@@ -279,7 +277,7 @@ class ContactRun {
     return most;
   }
 
-  PairSearch<T>& search() { return search_; }
+  NearSearch<T>& near() { return near_; }
   std::vector<Hand<T>>& hands() { return hands_; }
 
  private:
@@ -288,35 +286,36 @@ class ContactRun {
     Multiplier<T> force;
   };
 
-  T& radius(int v) { return balls_[v].radius; }
+  bool is_inside(int v, const Vec3<T>& place) const {
+    const Ball<T>& ball = balls_[v];
+    const Vec3<T> arm = place - ball.center;
+    if (dot(arm, arm) <= ball.radius * ball.radius) return true;
+    Vec3<T> copy = place;
+    return !move_into(ball, copy);
+  }
 
-  // targets, shifted by the forces of active pairs
-  void push(T c) {
-    for (int p : active_)
-      for (int v : list_.pairs[p].vertex) shift_[v] = target_[v];
-    for (int p : active_) {
-      const ContactPair<T>& pair = list_.pairs[p];
-      const Vec3<T> force = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
-      for (int a = 0; a < 4; ++a) {
-        const int v = pair.vertex[a];
-        shift_[v] = multiply_add(c * pair.near.weight[a] * inverse_[v], force, shift_[v]);
-      }
+  // Whether planes of its pairs may cut the way of a vertex, or whether it must stay.
+  enum class Limits : char { none, planes, stuck };
+
+  void renew_plane(ContactPair<T>& pair, const Places& to, const Vec3<T>& hand) {
+    make_plane(pair, place_, to, pair.near, hand);
+    for (int v : pair.vertex) {
+      if (pair.plane.frozen) limits_[v] = Limits::stuck;
+      if (limits_[v] == Limits::none) limits_[v] = Limits::planes;
     }
   }
 
-  // Planes that targets violate are made anew at the present iterate.
-  void refresh() {
-    for (ContactPair<T>& pair : list_.pairs) {
-      if (breaks(pair, target_)) make_plane(pair, place_, target_, pair.near, pair.plane.normal);
-    }
+  template <class Walls, class Visit>
+  void each_wall(int v, const Walls& walls, const Visit& visit) const {
+    const T here = place_rounding(place_[v]), there = place_rounding(target_[v]),
+            margin = here < there ? there : here;
+    walls(v, place_[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
   }
 
   template <class Walls, class Visit>
   void each_space(int v, const Walls& walls, const Visit& visit) const {
     list_.each_space(v, visit);
-    const T here = place_rounding(place_[v]), there = place_rounding(target_[v]),
-            margin = here < there ? there : here;
-    walls(v, place_[v], [&](const Vec3<T>& normal, T bound) { visit(normal, bound, margin); });
+    each_wall(v, walls, visit);
   }
 
   void cut(int v) {
@@ -333,17 +332,20 @@ class ContactRun {
     for (int v = 0; v < plan_.body_vertices; ++v) {
       if (!held_[v]) continue;
       const Vec3<T> way = goal_[v] - place_[v];
+      if (way.x == T(0) && way.y == T(0) && way.z == T(0)) continue;
       const auto at = [&](T share) {
         return share < T(1) ? multiply_add(share, way, place_[v]) : goal_[v];
       };
-      const T share =
-          list_.is_stuck(v) ? T(0) : largest_share<T>([&](T s) { return allowed(v, at(s)); });
+      const T share = limits_[v] == Limits::stuck
+                          ? T(0)
+                          : largest_share<T>([&](T s) { return allowed(v, at(s)); });
       shift_[v] = share > T(0) ? at(share) : place_[v];
       if (share < T(1)) cut(v);
     }
     for (Hand<T>& hand : hands_) {
+      if (hand.is_there()) continue;
       bool stuck = false;
-      for (int v = hand.begin; v < hand.end; ++v) stuck = stuck || list_.is_stuck(v);
+      for (int v = hand.begin; v < hand.end; ++v) stuck = stuck || limits_[v] == Limits::stuck;
       const Screw<T> screw(hand.pose, hand.goal);
       const T share = stuck ? T(0) : largest_share<T>([&](T s) {
         const Pose<T> pose = screw.at(s);
@@ -360,17 +362,16 @@ class ContactRun {
   }
 
   const ContactPlan<T>& plan_;
-  PairSearch<T> search_;
+  std::vector<char> held_, cut_;
+  NearSearch<T> near_;
+  ContactSweeps<T> sweeps_;
   PairList<T> list_;
   std::vector<Hand<T>> hands_;
-  std::vector<char> held_, is_surface_, cut_;
-  std::vector<T> inverse_, weights_;
+  std::vector<T> inverse_;
   Places begin_, place_, target_, goal_, shift_;
   std::vector<Ball<T>> balls_;
+  std::vector<Limits> limits_;
   std::vector<Known> known_;
-  std::vector<int> active_;
-  std::vector<ContactPair<T>> near_;  // of a search, before balls are known
-  std::vector<T> room_;               // to the nearest other side
   Places checked_place_;
   double checked_energy_ = 0;
   bool checked_ = false, cut_any_ = false, waits_ = false;

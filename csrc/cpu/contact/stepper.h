@@ -1,9 +1,13 @@
 // Runner of a step with contact between bodies on the CPU: one environment by one thread.
 #pragma once
-#include "cpu/contact/approach.h"
+#include "cpu/contact/coarse.h"
 #include "cpu/step/stepper.h"
 
 namespace pd::inline PD_TARGET {
+
+constexpr int coarse_pause = 8;  // iterations between coarse corrections
+constexpr int coarse_trials = 4;
+constexpr int coarse_last = 2;   // iterations before the last one, in which none comes
 
 // `HasContacts`: with planes and spheres of the scene, see solver/vertex.h.
 template <class T, bool HasContacts>
@@ -19,16 +23,14 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
  public:
   ContactStepper(const StepCall<T>& call, Workspace<Lanes>& work, Scratch<Lanes>& scratch,
                  const Team& team, std::int64_t environment, const ContactCall<T>& contact,
-                 ContactRun<T>& run, Approach<T>& approach)
+                 ContactRun<T>& run, Approach<T>& approach, CoarseContact<T>& coarse)
       : Base(call, work, scratch, team, environment),
         contact_(contact),
         run_(run),
         approach_(approach),
+        coarse_(coarse),
         environment_(environment),
-        inside_(plan_.vertices),
-        touches_(std::max(1, plan_.components)) {
-    for (int i = 0; i < plan_.vertices; ++i) inside_[plan_.vertex_order[i]] = i;
-  }
+        touches_(std::max(1, plan_.components)) {}
 
   void rollout() {
     this->load();
@@ -54,34 +56,29 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     begun_ = false;
   }
 
-  // Approach, search and the first iterate, as near to the corrected guess as the promise allows. At the end bodies that
-  // touch no other are corrected again.
+  // First approach, search and the first iterate, as near to the guess as the promise allows. Then the coarse correction.
   void align() {
-    if (!begun_) {
-      begun_ = true;
-      correct([&](const auto& visit) { run_.each_known(visit); });
-      want([&](int i) { return w_.u[i]; });
-      approach_.move(run_, [&](int v) { return mass(v); }, walls());
-      run_.find();
-      stay_where_stopped();
-      go();
-      for (int i = 0; i < plan_.vertices; ++i) w_.before[i] = w_.u[i];
-      return;
-    }
-    if (plan_.components == 0) return;
-    correct([&](const auto& visit) { run_.list().each_side(visit); });
+    if (begun_) return correct(true);
+    begun_ = true;
+    guess_alone();
     want([&](int i) { return w_.u[i]; });
-    run_.prepare(set_.iterations);
+    approach_.move(run_, [&](int v) { return mass(v); }, walls());
+    run_.find();
+    stay_where_stopped();
     go();
+    correct(false);
+    for (int i = 0; i < plan_.vertices; ++i) w_.before[i] = w_.u[i];
   }
 
   void iterate(int k) {
+    if (k > 0 && k % coarse_pause == 0 && set_.iterations - k > coarse_last) correct(false);
     const T omega(next_omega_[0]);
     const bool guards = schedule_[0].checks_energy(k);
     run_.look();
-    sweep_.run(k & 1, elastic_gradient<true>(), [&](std::int64_t i, const Value& force, Sum& sums) {
+    const auto gradient = elastic_gradient<true>(guards);
+    sweep_.run(k & 1, gradient, [&](std::int64_t i, const Value& force, Sum& sums) {
       const auto v = vertex(i);
-      sums.energy = v.add_energy(w_.u[i], sums.energy);
+      if (guards) sums.energy = v.add_energy(w_.u[i], sums.energy);
       free_[i] = Lanes::vec3(accelerate(w_.u[i], w_.before[i], v.gradient(w_.u[i], force),
                                         theta_ * w_.inverse[i], omega));
     });
@@ -120,20 +117,100 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     for (int v = plan.body_vertices; v < plan.vertices; ++v) run_.target()[v] = run_.goal()[v];
   }
 
-  // The coarse correction of components without a vertex of each_touching(visit).
-  template <class Each>
-  void correct(const Each& each_touching) {
+  // The guess of components without forces of contact: the present shape or h v, after a coarse correction of its own.
+  void guess_alone() {
     for (int i = 0; i < plan_.vertices; ++i) free_[i] = Lanes::vec3(w_.u[i]);
     Base::align();
     std::fill(touches_.begin(), touches_.end(), 0);
-    each_touching([&](int v) {
-      const int g = v < int(inside_.size()) ? plan_.vertex_component[inside_[v]] : -1;
+    run_.each_known([&](int v) {
+      const int g = coarse_.component(v);
       if (g >= 0) touches_[g] = 1;
     });
     for (int i = 0; i < plan_.vertices; ++i) {
       const int g = plan_.vertex_component[i];
       if (g >= 0 && touches_[g]) w_.u[i] = Lanes::value(free_[i]);
     }
+  }
+
+  // The coarse correction of bodies that pairs join; `alone`: and of all others. It shifts both iterates alike. Where a motion
+  // is cut, forces grow with the gaps of now, and another one follows.
+  void correct(bool alone) {
+    for (int n = 0; n < coarse_trials && correct_once(alone); ++n) continue;
+  }
+
+  // Whether a motion was cut.
+  bool correct_once(bool alone) {
+    coarse_.begin(run_);
+    bool some = false, cut = false;
+    for (int g = 0; g < plan_.components; ++g) some = some || asks(g, alone);
+    if (!some) return false;
+    run_.look();
+    keep_wall_forces();
+    sum_bodies(plan_, w_);
+    for (int i = 0; i < plan_.vertices; ++i) {
+      free_[i] = old_[i] = Lanes::vec3(w_.u[i]);
+      previous_[i] = Lanes::vec3(w_.before[i]);
+    }
+    bool pushes = false;
+    for (int g = 0; g < plan_.components; ++g) {
+      if (!asks(g, alone)) continue;
+      coarse_.template find<HasContacts>(run_, w_, g, contacts_);
+      if (!coarse_.is_valid()) continue;
+      const T share(coarse_.move(run_, w_, g));
+      cut = cut || share < T(1);
+      coarse_.each_vertex(g, [&](int i) {
+        const Vec3<T> push = share * wall_push(i);
+        pushes = pushes || dot(push, push) > T(0);
+        w_.u[i] = Lanes::value(run_.place()[plan_.vertex_order[i]]) - w_.x[i];
+        free_[i] = Lanes::vec3(w_.u[i]) + push;
+      });
+    }
+    run_.remember();
+    run_.forget_check();
+    want([&](int i) { return Lanes::value(free_[i]); });
+    if constexpr (HasContacts) leave_walls();
+    if (coarse_.leaves_list()) run_.find();
+    run_.look();
+    run_.refresh(run_.place());
+    if (pushes) {
+      run_.refresh(run_.target());
+      go();
+    }
+    for (int i = 0; i < plan_.vertices; ++i)
+      w_.before[i] = Lanes::value(previous_[i]) + (w_.u[i] - Lanes::value(old_[i]));
+    return cut;
+  }
+
+  bool asks(int root, bool alone) const {
+    return coarse_.is_island(root) && (alone || coarse_.has_pairs(root));
+  }
+
+  // The forces with which planes and spheres answer those of elements, inertia and pairs.
+  void keep_wall_forces() {
+    if constexpr (HasContacts) {
+      forces_.assign(run_.plan().vertices, Vec3<T>{T(0), T(0), T(0)});
+      run_.list().add_forces(forces_);
+      this->each_elastic_force([&](std::int64_t i, const Vec3<double>& force) {
+        const Vec3<T>& push = forces_[plan_.vertex_order[i]];
+        this->keep_forces(i, force - widened<double>(push), 1.0);
+      });
+    }
+  }
+
+  // What planes and spheres push after the whole motion of a body.
+  Vec3<T> wall_push(int i) const {
+    const auto narrowed = [](const Vec3<double>& a) {
+      return Vec3<T>{T(a.x), T(a.y), T(a.z)};
+    };
+    if constexpr (HasContacts) {
+      const Value moved = vertex(i).displaced(w_.u[i], narrowed(coarse_.way(w_, i)));
+      CoarseVertex<double> v = coarse_vertex(w_, i);
+      v.u = widened<double>(Lanes::vec3(moved));
+      const auto forces = this->forces_of(i);
+      const Value out = vertex(i).displaced(moved, narrowed(push_of(contacts_, v, forces)));
+      return Lanes::vec3(vertex(i).project(contacts_, out, out) - moved);
+    }
+    return {T(0), T(0), T(0)};
   }
 
   // calls visit(normal, bound) for planes and spheres of the scene, no deeper than at the place of a vertex
@@ -273,10 +350,11 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   const ContactCall<T>& contact_;
   ContactRun<T>& run_;
   Approach<T>& approach_;
+  CoarseContact<T>& coarse_;
   std::int64_t environment_;
-  // displacements of the next iterate before contact; a Quad is aligned more than std::vector grants
-  std::vector<Vec3<T>> free_ = std::vector<Vec3<T>>(plan_.vertices);
-  std::vector<int> inside_;      // internal number of the user's vertices
+  // displacements of the next iterate before contact; and of this one and the last before a correction. A Quad is aligned
+  // more than std::vector grants
+  std::vector<Vec3<T>> free_ = std::vector<Vec3<T>>(plan_.vertices), old_ = free_, previous_ = free_;
   std::vector<char> touches_;    // [components]
   std::vector<Vec3<T>> forces_;  // of contact, on every vertex
   double residual_ = 0;

@@ -86,6 +86,8 @@ class CoarseBody {
   }
 
  private:
+  friend class CoarseIsland;  // steps of several bodies at once
+
   // A symmetric 6 x 6 matrix by its lower triangle, row by row, and as row 6 a right side.
   static constexpr int terms_count = 27;
   PD_HD static constexpr int at(int row, int column) { return row * (row + 1) / 2 + column; }

@@ -104,7 +104,7 @@ def _together(
     count = len(deformable)
     end = way(torch.ones(count, dtype=start.dtype))
     pairs = _between(surfaces, start, end, deformable)
-    normals, least = _directions(pairs, start, end)
+    normals, least = directions_of(pairs, start, end)
     body = surfaces.body[pairs.vertices[:, [0, 3]]]
     both = body[moving[body].all(dim=1)]
     graph = coo_array((np.ones(len(both)), both.T.numpy()), shape=(count, count))
@@ -140,7 +140,7 @@ def _alone(
     return largest_shares(way, surfaces.body, count, HalfSpaces.of(pairs, planes), anywhere, walls, stuck)
 
 
-def _directions(pairs: Pairs, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
+def directions_of(pairs: Pairs, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
     """The direction [m, 3] with the largest gap at both ends, and the gap [m] m that must be kept along it.
 
     That is the floor, or the gap at the start where it is less. If no direction has it at both ends, the one with the
@@ -175,7 +175,7 @@ def _unfolded(surfaces: Surfaces, positions: Tensor, ways: Tensor, rigid: Tensor
     free = torch.ones(len(surfaces.self_contact), dtype=torch.bool)
     if len(pairs):
         end = positions + ways
-        normals, least = _directions(pairs, positions, end)
+        normals, least = directions_of(pairs, positions, end)
         corners = pairs.corners(end)
         gap = gap_along(normals[:, None], corners, pairs.points)[:, 0]
         folds = (gap < least) | (least <= gap_bounds(corners))

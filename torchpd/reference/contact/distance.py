@@ -72,11 +72,9 @@ def edge_edge(corners: Tensor) -> Tensor:
     c, f = _dot(first, r), _dot(second, r)
     zero, one = torch.zeros_like(a), torch.ones_like(a)
     ends = [(zero, _share(f, e)), (one, _share(f + b, e)), (_share(-c, a), zero), (_share(b - c, a), one)]
-    # |d1 x d2|^2: without it edges count as parallel
-    det = a * e - b * b
-    skew = det > (1e-14 if corners.dtype == torch.float64 else 1e-6) * a * e
-    s = torch.where(skew, ((b * f - c * e) / torch.where(skew, det, one)).clamp(0.0, 1.0), zero)
-    t = _share(b * s + f, e)
+    # (d1 x d2) . (d2 x r) / |d1 x d2|^2: differences of dot products would cancel for nearly parallel edges
+    normal = _exact_cross(first, second)
+    t = _share(b * _share(_dot(normal, _exact_cross(second, r)), _dot(normal, normal)) + f, e)
     ends.append((_share(b * t - c, a), t))
     s, t = (torch.stack(of, dim=1) for of in zip(*ends, strict=True))
     between = r[:, None] + s[:, :, None] * first[:, None] - t[:, :, None] * second[:, None]
@@ -88,6 +86,28 @@ def edge_edge(corners: Tensor) -> Tensor:
 
 def _dot(a: Tensor, b: Tensor) -> Tensor:
     return (a * b).sum(dim=-1)
+
+
+def _exact_cross(one: Tensor, other: Tensor) -> Tensor:
+    """Cross products [m, 3], every component to about one rounding."""
+    (a, b, c), (x, y, z) = one.unbind(1), other.unbind(1)
+
+    def difference(p: Tensor, q: Tensor, u: Tensor, v: Tensor) -> Tensor:
+        return (p * q - u * v) + (_lost(p, q) - _lost(u, v))
+
+    return torch.stack([difference(b, z, c, y), difference(c, x, a, z), difference(a, y, b, x)], dim=1)
+
+
+def _lost(p: Tensor, q: Tensor) -> Tensor:
+    """p q less its rounding to p * q, by halves of the digits (Dekker 1971)."""
+    splitter = 2.0**27 + 1.0 if p.dtype == torch.float64 else 2.0**12 + 1.0
+    halves = []
+    for number in (p, q):
+        scaled = splitter * number
+        high = scaled - (scaled - number)
+        halves.append((high, number - high))
+    (ph, pl), (qh, ql) = halves
+    return ((ph * qh - p * q) + ph * ql + pl * qh) + pl * ql
 
 
 def _share(part: Tensor, whole: Tensor) -> Tensor:

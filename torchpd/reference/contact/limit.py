@@ -193,13 +193,15 @@ def largest_shares(
     return halved(allowed, held, balls.radii.dtype)
 
 
-def halved(allowed: Callable[[Tensor], Tensor], held: Tensor, dtype: torch.dtype) -> Tensor:
+def halved(
+    allowed: Callable[[Tensor], Tensor], held: Tensor, dtype: torch.dtype, halvings: int = _HALVINGS
+) -> Tensor:
     """Largest shares [n] in [0, 1] that are `allowed`, by halving; 0 of what is `held` [n]."""
     least, most = torch.zeros(len(held), dtype=dtype), torch.ones(len(held), dtype=dtype)
     whole = allowed(most) & ~held
     if whole.all():
         return most
-    for _ in range(_HALVINGS):
+    for _ in range(halvings):
         middle = torch.where(whole, 1.0, torch.where(held, 0.0, 0.5 * (least + most)))
         fine = allowed(middle)
         least, most = torch.where(fine, middle, least), torch.where(fine, most, middle)

@@ -23,11 +23,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...common.tables import PLANES, SPHERES
+from ..coarse import RigidMotions, correct, islands
+from ..envelopes import pushes_of
 from ..geometry import sphere_normals
+from ..pair_step import pair_envelopes
 from ..problem import StepProblem, step_problem
 from ..schedules import Guarded
 from ..solvers import guard_tolerance
 from .approach import approach
+from .coarse import RigidWay, changed_forces, pairs_between, share_of
 from .distance import Closest
 from .hands import Hands
 from .limit import Walls, into_balls, limit
@@ -41,7 +45,10 @@ Array = NDArray[np.float64]
 
 CHECK = 4  # iterations between checks of the guard
 PAUSE = 5  # least iterations between searches: a guard that every search blinds would never see a rise
-SWEEPS = 4
+SWEEPS = 8  # with 4 an edge that lies on an edge cycles
+PASSES = 64  # of a coarse correction; most of them take 5 to 30
+TRIALS = 4  # of a coarse correction whose motions are cut
+EVERY = 8  # iterations between coarse corrections
 
 
 @dataclass(frozen=True)
@@ -101,9 +108,14 @@ def contact_step(
     if observe is not None:
         observe(0, run.current)
     for k in range(iterations):
+        if k and k % EVERY == 0 and iterations - k > 2:
+            run.correct()
         run.iterate(k)
         if observe is not None:
             observe(k + 1, run.current)
+    run.correct(alone=True)
+    if observe is not None:
+        observe(iterations + 1, run.current)
     return run.result()
 
 
@@ -146,6 +158,7 @@ class _Run:
         self.searched_at = self.searches = self.most = 0
         self.frozen = self.shortened = self.restarts = 0
         self.first_residual = 0.0
+        self.shares: list[float] = []
 
     def _place(self, displacement: Array) -> Tensor:
         """Places [V, 3] m of displacements [V, 3] m."""
@@ -181,6 +194,7 @@ class _Run:
         # what was stopped starts where it was: nearer to x_t + h v it would only be squashed
         stopped = (begun.shares < 1.0)[surfaces.body] & ~surfaces.kinematic
         self._move(torch.where(stopped[:, None], self.current, want))
+        self.correct()
         self.previous = self.current
 
     def _search(self, want: Tensor) -> None:
@@ -221,6 +235,87 @@ class _Run:
         self.previous = torch.where(cut[:, None], self.current, before)
         self.frozen += int((stuck & mobile).sum())
         self.shortened += int(cut.sum())
+
+    def correct(self, *, alone: bool = False) -> None:
+        """The coarse correction of bodies that pairs join; `alone`: and of all others.
+
+        Where a motion is cut, forces grow with the gaps of now, and another one follows.
+        """
+        for _ in range(TRIALS):
+            if not self._correct(alone=alone):
+                return
+
+    def _correct(self, *, alone: bool) -> bool:
+        """One correction; whether a motion was cut."""
+        scene, problem, x, contacts = self.scene, self.problem, self.current, self.contacts
+        u, before = self._displacement(x), self.previous
+        component = torch.full((len(x),), -1)
+        component[: scene.count] = torch.tensor(problem.values.component)
+        component[scene.count :] -= 1 + scene.collider[scene.count :]
+        numbers, pairs = pairs_between(problem, contacts, contacts.near(x), x, self.begin)
+        near = contacts.near(x)
+        push = forces(contacts.pairs, near.weights, contacts.normals(near), contacts.held, len(x))
+        gradient = np.where(problem.free[:, None], problem.gradient(u) - _array(push[: scene.count]), 0.0)
+        moved = correct(problem, u, pushes_of(problem, u, gradient), pairs, push_pairs=False, passes=PASSES)
+        rigid, swept, cut, places = moved.displacement - moved.pushes, False, False, x
+        normal, tangential = contacts.held.normal.clone(), contacts.held.tangential.clone()
+        pushes = torch.zeros_like(x)
+        for bodies, of in islands(problem, pairs):
+            own = np.concatenate(bodies)
+            if not (alone or len(of)) or not (moved.displacement[own] != u[own]).any():
+                continue
+            motions = RigidMotions(problem, u, bodies)
+            ways = [
+                RigidWay.between(body, (problem.positions + u)[body], (problem.positions + rigid)[body], center)
+                for body, (center, _) in zip(motions.free, motions.bases, strict=True)
+            ]
+            if not all(way.is_valid for way in ways):
+                continue
+            moving, chords = torch.zeros(len(x), dtype=torch.bool), torch.zeros_like(self.inverse)
+            for way in ways:
+                moving[torch.as_tensor(way.vertices)] = True
+                chords[torch.as_tensor(way.vertices)] = torch.as_tensor(way.chords).to(x.dtype)
+            here = places
+
+            def after(share: float) -> Tensor:
+                out = here.clone()
+                for way in ways:
+                    own = torch.as_tensor(way.vertices)
+                    out[own] = torch.as_tensor(way.at(share)).to(x.dtype)
+                return out
+
+            share, leaves = share_of(scene.surfaces, component, None if swept else contacts, here, after, chords, moving)
+            self.shares.append(share)
+            swept |= leaves
+            places = after(share) if share > 0.0 else here
+            pushes[torch.as_tensor(own)] = share * torch.as_tensor(moved.pushes[own]).to(x.dtype)
+            cut |= share < 1.0
+            index = torch.as_tensor(numbers[of])
+            chosen = pairs.chosen(of)
+            if share < 1.0:
+                at = pair_envelopes(problem, chosen, self._displacement(places))
+                each = at.forces(chosen.friction * at.normal_forces())
+            else:
+                each = changed_forces(pair_envelopes(problem, chosen, u), moved.forces[of])
+            each = torch.as_tensor(each).to(x.dtype)
+            n = torch.as_tensor(chosen.normals).to(x.dtype)
+            normal[index] = (each * n).sum(dim=1)
+            tangential[index] = each - normal[index, None] * n
+        held = Multipliers(normal.clamp(min=0.0), tangential)
+        self.keys, self.known = contacts.pairs.keys, held
+        self.current, self.contacts, self.checked = places, replace(contacts, held=held), None
+        target = places + pushes
+        target = self._by_hand(target[: scene.count])
+        if len(problem.values.planes) or len(problem.values.spheres):
+            target = self._by_hand(self._place(problem.project(self._displacement(target), self._displacement(places))))
+        if swept:
+            self._search(target)
+        self.contacts = self.contacts.refreshed(places, places, self.contacts.near(places))
+        if pushes.any():
+            self.contacts = self.contacts.refreshed(places, target, self.contacts.near(places))
+            self._move(target)
+        self.previous = before + self.current - x
+        return cut
 
     def iterate(self, k: int) -> None:
         """x_k to x_{k+1}."""

@@ -1,0 +1,42 @@
+// What the adjoint of a step reads of the pairs with forces at its end.
+#pragma once
+#include "contact/views.h"
+#include "views/views.h"
+
+#include <cstdint>
+
+namespace pd {
+
+// All of [batch, ...]; bodies by the user's numbers.
+template <class T>
+struct LoadedPairs {
+  ContactPlan<T> plan;
+  const T *before, *after;              // [vertices, 3] of bodies
+  const T *poses_before, *poses_after;  // [colliders, 7]
+  const std::int64_t* keys;             // [capacity], -1 pads at the end
+  const T* forces;                      // [capacity, 4]
+};
+
+// Derivatives of a loss by what the pairs of a solved adjoint depend on.
+template <class T>
+struct PairGradients {
+  T *end, *start;              // [batch, vertices, 3] of bodies: K^T l + C^T nu, by the places then
+  T *poses_end, *poses_start;  // [batch, colliders, 7]
+  T* friction;                 // [batch, bodies, bodies]
+  T* thickness;                // [batch]
+};
+
+// A solved adjoint, as in a ConjugateCall; [batch, vertices, 3] each.
+template <class T>
+struct PairGradientsCall {
+  Plan<T> plan;
+  LoadedPairs<T> pairs;
+  Values<T> inertia, inverse;  // [vertices]
+  std::int64_t batch = 0;
+  const T *right, *multiplier;
+  const T* elastic;              // elastic Hessian times the multiplier
+  const T *projector, *sliding;  // may be null
+  PairGradients<T> out;
+};
+
+}  // namespace pd
