@@ -184,6 +184,20 @@ def plates(to: float, seconds: float = 0.2) -> tuple[Course, pd.Collider, pd.Col
     return Course(scene, targets=targets), upper, lower
 
 
+def pressed_cubes(speed: float = 0.3) -> Course:
+    """A cube, pinned at its upper part, is pressed on another one, turned, which is pinned at its lower side."""
+    lower = block(0.1, 3, (0.0, 0.05, 0.0))
+    upper = block(0.1, 3, (0.015, 0.18, 0.01), rotation(0.0, 17.0, 12.0))
+    pins = [pd.Pin(lower, lower.mesh.vertices[:, 1] < 1e-6), pd.Pin(upper, upper.mesh.vertices[:, 1] > 0.2)]
+    scene = pd.Scene(lower, upper, *pins, gravity(), pd.Contact(friction=0.5, thickness=THICKNESS))
+    held = torch.tensor(upper.mesh.vertices[upper.mesh.vertices[:, 1] > 0.2])
+
+    def targets(number: int) -> dict[Any, Tensor]:
+        return {pins[1]: held - torch.tensor([0.0, speed * H * (number + 1), 0.0], dtype=torch.float64)}
+
+    return Course(scene, targets=targets)
+
+
 def two_sheets(cells: int) -> Course:
     """A level cloth of .4 m falls on another one, which is pinned, by a tenth of a millimetre."""
     lower, upper = (cloth(plane(0.4, 0.4, cells).translated((0.0, height, 0.0))) for height in (0.0, 0.0011))
