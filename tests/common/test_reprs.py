@@ -7,7 +7,7 @@ import torch
 from torch._subclasses import FakeTensorMode
 
 import torchpd as pd
-from torchpd.simulation.readouts import Wrench
+from torchpd.simulation.wrenches import Wrench
 from torchpd.viewing.render import Camera
 
 MESH = pd.shapes.box((1.0, 0.2, 0.2), (5, 1, 1))

@@ -72,7 +72,6 @@ STEPS: dict[str, Callable[[], object]] = {
         lambda target: SIM(STATE, targets={LEFT: target}).positions
     )(pose()[None]),
     "capture: the scene must have no Contact": lambda: SIM.capture(STATE),
-    "contact_forces: the scene must have no Contact.*history.forces": lambda: SIM.contact_forces(STATE, STATE),
     "state must be a HistoryState, in a scene with Contact, .* got State": lambda: SIM(pd.State(*STATE[:2])),
     "targets of a Collider must be finite poses .* quaternion is not zero": lambda: SIM(
         STATE, targets={LEFT: torch.zeros(7, dtype=torch.float64)}

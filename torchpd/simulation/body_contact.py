@@ -13,6 +13,7 @@ from ..plan.contact_plan import ContactPlan, contact_plan
 from ..plan.contact_start import check_start
 from ..scene.contact import placed
 from ..scene.scene import SceneValues
+from .pair_forces import ContactSurfaces
 from .state import ContactHistory, HistoryState, State
 
 __all__ = ["BodyContact"]
@@ -94,6 +95,13 @@ class BodyContact:
         # the residual of other scenes would count forces between bodies as unbalanced
         rows = torch.cat([numbers[:, _UNBALANCED, None], rows[:, _RESIDUAL + 1 :], own], dim=1)
         return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
+
+    @property
+    def surfaces(self) -> ContactSurfaces:
+        """What forces between surfaces are read by."""
+        triangles, edges, _, body, collider = self.arrays[1:6]
+        points, cell, _, thickness = self.arrays[12:]
+        return ContactSurfaces(triangles, edges, body, collider, points, cell, thickness)
 
     @staticmethod
     def check_transforms(*given: Tensor) -> None:

@@ -22,8 +22,9 @@ from ..scene.rod import Rod
 from ..scene.springs import Springs
 from ..scene.targets import Targets
 from .model import Model
+from .pair_forces import Met, pair_forces
 from .readouts import ContactForces, Reactions, contact_forces, reactions
-from .state import HistoryState, State
+from .state import ContactHistory, HistoryState, State
 from .stencil_readouts import MembraneStress, Tension, membrane_stress, tensions
 from .stress import STRESS_ROWS, Stress, plastic_strain, stress, vertex_average
 from .volume import volumes
@@ -100,37 +101,49 @@ class Readable(Model):
         *,
         about: Tensor | None = None,
     ) -> ContactForces:
-        """Forces of grounds and spheres on the vertices [N] in the step from `state` to `after`; not with `Contact`.
+        """Forces of all contacts on the vertices [N] in the step from `state` to `after`.
 
-        They are the part of the objective's gradient at `after` that contacts can supply: normal forces, and friction
-        up to Coulomb's bound. If several colliders hold a vertex, normal forces are fitted to the gradient, and
+        Those between the surfaces of `Contact` are the ones that the step left in `after.history`. Those of grounds and
+        spheres are the part of the remaining gradient of the objective at `after` that these can supply: normal forces,
+        and friction up to Coulomb's bound. If several hold a vertex, normal forces are fitted to the gradient, and
         friction is shared; `torchpd.simulation.readouts` states the rule. `residual` is the part that neither contacts
-        nor pins
-        balance: compare it with the forces to see how far to trust them. Hard pins take the whole gradient at their
-        vertices. Differentiable.
+        nor pins balance: compare it with the forces to see how far to trust them. Hard pins take the whole gradient at
+        their vertices. Differentiable, at fixed `after.history`.
 
         Args:
             state: start of the step.
-            after: end of the step, a `State` or positions [B, V, 3].
+            after: end of the step, a `State` or positions [B, V, 3]; with `Contact` the `HistoryState` that it
+                returned.
             forces: as in `forward`, the same as in that step.
             targets: as in `forward`, the same as in that step.
-            about: point of torques [3] or [B, 3] [m]; by default the centre of mass of each body at `after`.
+            about: point of torques [3] or [B, 3] [m]; by default the centre of mass of each body at `after`, and the
+                actual origin of each collider.
 
         Returns:
-            Forces of all colliders [B, V, 3], and of each: `contacts.colliders[ground].force`. Sums and torques by
-            body: `contacts.bodies[solid].force` [B, 3]. `colliders` is empty if the scene has none.
+            Forces of all contacts [B, V, 3], and of each ground and sphere: `contacts.colliders[ground].force`. Sums
+            and torques by body and `Collider`: `contacts.bodies[solid].force` [B, 3]. Of two that touch, on the first:
+            `contacts.between[cube, table].force` [B, 3]. All wrenches on colliders [B, C, 6]: `contacts.on_colliders`.
+            Pair by pair: `contacts.pairs`. What the scene lacks is empty.
 
         Example:
             >>> after = sim(state)
             >>> contacts = sim.contact_forces(state, after)
             >>> contacts.bodies[cube].force  # [B, 3] N, of a cube at rest its weight, upwards
         """
-        if self.body_contact is not None:
-            raise RuntimeError(
-                "contact_forces: the scene must have no Contact, whose forces it would give to grounds and spheres; "
-                "after.history.forces [B, M, 4] N has those between surfaces"
+        call = self.checked_call(state, after, forces, targets)
+        return contact_forces(self.scene, call, about, self._met(after))
+
+    def _met(self, after: State | HistoryState | Tensor) -> Met | None:
+        """What surfaces did to each other in a step to `after`, which is checked; None without `Contact`."""
+        if self.body_contact is None:
+            return None
+        if isinstance(after, Tensor):
+            raise TypeError(
+                "after must be a HistoryState in a scene with Contact, whose history has the forces between surfaces, "
+                "got positions alone; give the state that the step returned"
             )
-        return contact_forces(self.scene, self.checked_call(state, after, forces, targets), about)
+        history = ContactHistory(*after[2])  # type: ignore[misc]
+        return pair_forces(self.body_contact.surfaces, after[0], history)
 
     def reactions(
         self,
@@ -144,9 +157,9 @@ class Readable(Model):
         """Forces of pins and ties on their vertices [N] in the step from `state` to `after`.
 
         The force of a hard pin is the gradient of the step's objective without pins, that of a soft one k (target -
-        x'). The force of a hard pin therefore includes contact forces at its vertices, and the residual of the solve
-        there. The residual of other vertices is `ContactForces.residual`. A tie pulls its vertex by k (point - x').
-        Differentiable.
+        x'). The force of a hard pin therefore includes those of grounds and spheres at its vertices, and the residual
+        of the solve there, but not those between surfaces of `Contact`. The residual of other vertices is
+        `ContactForces.residual`. A tie pulls its vertex by k (point - x'). Differentiable.
 
         Args:
             state, after, forces, targets, about: as in `contact_forces`.
@@ -156,7 +169,8 @@ class Readable(Model):
             `reactions.pins[pin].wrench.force` [B, 3] is its total, and `reactions.ties[tie].force` [B, n, 3] the force
             on the vertices of a tie. `pins` and `ties` are empty if the scene has none.
         """
-        return reactions(self.scene, self.checked_call(state, after, forces, targets), about)
+        call = self.checked_call(state, after, forces, targets)
+        return reactions(self.scene, call, about, self._met(after))
 
     def stress(self, state: State | HistoryState | Tensor) -> Stress:
         """Cauchy stress [B, E, 3, 3] and von Mises stress [B, E] [Pa] of every tetrahedron, and its strain.

@@ -20,6 +20,9 @@ csrc/solver/adjoint/contact_gradients.h. The rest t is tangential to all of them
 mu_k p_k, and together take no more than that (Coulomb). So in a corner normal forces come first. The part that contacts
 do not take is the residual.
 
+Surfaces. With `Contact` the forces between surfaces are known, see torchpd/simulation/pair_forces.py. They count among
+the forces of the gradient, so that pins and colliders take the rest.
+
 Sums over vertices follow a fixed binary tree, so an environment has the same bits in every batch.
 """
 
@@ -33,18 +36,20 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..common.checks import to_full_precision
 from ..common.reprs import by_sizes
-from ..common.small_matrices import dot, inverse, length, product, tree_sum
+from ..common.small_matrices import dot, inverse, length, product
 from ..common.tables import PLANES, SPHERES
 from ..ops.adjoint import AdjointCall, step_gradient
 from ..ops.diagonal import named_material, pinned_vertices, step_diagonal
 from ..plan.material import CORE_ROWS
+from ..scene.contact import Member
 from ..scene.effects import Ground, Pin, Sphere
 from ..scene.part import Body
 from ..scene.scene import Scene
 from ..scene.tie import Tie
+from .pair_forces import Met, PairForces, empty_pairs
 from .stencil_readouts import forces_of_ties
+from .wrenches import Loaded, Wrench, between, loaded_bodies, loaded_colliders, wrench, wrenches
 
 __all__ = [
     "ContactForce",
@@ -52,7 +57,6 @@ __all__ = [
     "PinForce",
     "Reactions",
     "TieForce",
-    "Wrench",
     "contact_forces",
     "reactions",
 ]
@@ -60,17 +64,6 @@ __all__ = [
 _SPANNED = 1e-6  # Gram determinant from which normals count as independent, as in csrc/contact/plane_sphere.h
 _FASTEST = 4.0  # bound of relaxation times acceleration, both below 2
 _PIN_STIFFNESS = CORE_ROWS.index("pin_stiffness")
-
-
-class Wrench(NamedTuple):
-    """Sum of forces on vertices, and their torque."""
-
-    force: Tensor  # [B, 3] N
-    torque: Tensor  # [B, 3] N m, sum of (x' - about) x force
-    about: Tensor  # [B, 3] m, the point that the torque is about
-
-    def __repr__(self) -> str:
-        return by_sizes(self, self.force, "batch")
 
 
 class ContactForce(NamedTuple):
@@ -89,10 +82,13 @@ class ContactForce(NamedTuple):
 class ContactForces(NamedTuple):
     """Forces of all contacts on the vertices in a step, see `Simulator.contact_forces`."""
 
-    force: Tensor  # [B, V, 3] N, of all colliders together, on the vertices
+    force: Tensor  # [B, V, 3] N, of all contacts together, on the vertices
     residual: Tensor  # [B, V, 3] N, the part that neither contacts nor pins balance; zero at a solved step
-    bodies: dict[Body, Wrench]  # sum and torque of all colliders on each body
-    colliders: dict[Ground | Sphere, ContactForce]  # empty without colliders
+    bodies: dict[Member, Wrench]  # sum and torque of all contacts on each body and collider of `Contact`
+    colliders: dict[Ground | Sphere, ContactForce]  # by ground and sphere; empty without any
+    between: dict[tuple[Member, Member], Wrench]  # on the first by the second; empty without `Contact`
+    on_colliders: Tensor  # [B, C, 6] N and N m, force and torque on each `Collider` about its actual origin
+    pairs: PairForces  # forces between surfaces, pair by pair
 
     def __repr__(self) -> str:
         return by_sizes(self, self.force, "batch", "vertices")
@@ -130,50 +126,6 @@ class Reactions(NamedTuple):
         return by_sizes(self, self.force, "batch", "pinned")
 
 
-# ---- sums
-
-
-class _Body(NamedTuple):
-    """Vertices of a body, and the point that its torques are about."""
-
-    rows: slice
-    positions: Tensor  # [B, n, 3] m
-    about: Tensor  # [B, 3] m
-
-
-def _bodies(scene: Scene, positions: Tensor, masses: Tensor, about: Tensor | None) -> dict[Body, _Body]:
-    found: dict[Body, _Body] = {}
-    point = None if about is None else _checked_point(about, positions)
-    for body in scene.bodies:
-        rows = scene.vertex_range(body)
-        own, weights = positions[:, rows], masses[..., rows, None]
-        center = tree_sum(weights * own) / tree_sum(weights) if point is None else point
-        found[body] = _Body(rows, own, center)
-    return found
-
-
-def _checked_point(about: Tensor, positions: Tensor) -> Tensor:
-    if not isinstance(about, Tensor):
-        raise TypeError(
-            f"about must be a point [3] or [B, 3] as a tensor of {positions.dtype} [m], or None for the centre of mass "
-            f"of each body, got {type(about).__name__}; torch.tensor(..., dtype=sim.dtype, device=sim.device) makes one"
-        )
-    batch = len(positions)
-    point: Tensor = to_full_precision(about, positions)
-    if point.dtype != positions.dtype or point.device != positions.device:
-        raise TypeError(f"about must be {positions.dtype} on {positions.device}, got {point.dtype} on {point.device}")
-    if point.shape not in ((3,), (1, 3), (batch, 3)):
-        raise ValueError(f"about must be a point [3] or [{batch}, 3] [m], got {list(point.shape)}")
-    return point.expand(batch, 3)
-
-
-def _wrench(forces: Tensor, positions: Tensor, about: Tensor) -> Wrench:
-    """Sum and torque of forces [B, ..., n, 3] on vertices at positions [B, n, 3]."""
-    arms = (positions - about[:, None]).reshape(len(positions), *[1] * (forces.dim() - 3), *positions.shape[1:])
-    torque = tree_sum(torch.linalg.cross(arms.expand_as(forces), forces))
-    return Wrench(tree_sum(forces), torque, about)
-
-
 # ---- pins
 
 
@@ -191,22 +143,22 @@ def _pin_forces(call: AdjointCall) -> tuple[Tensor, Tensor]:
     return forces, gradient.index_add(1, pins, -forces)
 
 
-def reactions(scene: Scene, call: AdjointCall, about: Tensor | None) -> Reactions:
-    """Implementation of `Simulator.reactions` for a checked call."""
-    forces, _ = _pin_forces(call)
+def reactions(scene: Scene, call: AdjointCall, about: Tensor | None, met: Met | None) -> Reactions:
+    """Implementation of `Simulator.reactions` for a checked call; arguments as in `contact_forces`."""
+    forces, _ = _pin_forces(with_pairs(call, met))
     vertices = pinned_vertices(call.plan)
     on_vertices = torch.zeros_like(call.after).index_add(1, vertices, forces)
     material = named_material(call.material)
-    bodies = _bodies(scene, call.after, material["masses"], about)
+    bodies = loaded_bodies(scene, call.after, material["masses"], about)
     pins: dict[Pin, PinForce] = {}
     for pin in scene.pins:
         rows = scene.pin_range(pin)
         own = forces[:, rows]
-        pins[pin] = PinForce(own, _wrench(own, call.after[:, vertices[rows]], bodies[pin.body].about))
+        pins[pin] = PinForce(own, wrench(own, call.after[:, vertices[rows]], bodies[pin.body].about))
     ties: dict[Tie, TieForce] = {}
     for tie, own in forces_of_ties(scene, call.after, material).items():
         body = bodies[tie.body]
-        ties[tie] = TieForce(own, _wrench(own, body.positions[:, tie.vertices.tolist()], body.about))
+        ties[tie] = TieForce(own, wrench(own, body.positions[:, tie.vertices.tolist()], body.about))
     return Reactions(forces, on_vertices, pins, ties)
 
 
@@ -316,33 +268,64 @@ def _sum_over_contacts(values: Tensor) -> Tensor:
     return total
 
 
-def contact_forces(scene: Scene, call: AdjointCall, about: Tensor | None) -> ContactForces:
-    """Implementation of `Simulator.contact_forces` for a checked call."""
-    _, force = _pin_forces(call)
+def contact_forces(scene: Scene, call: AdjointCall, about: Tensor | None, met: Met | None) -> ContactForces:
+    """Implementation of `Simulator.contact_forces` for a checked call, whose forces are without those between surfaces.
+
+    Args:
+        scene: of the simulator.
+        call: the step.
+        about: point of torques.
+        met: what surfaces did to each other in the step; None without `Contact`.
+    """
+    pairs = empty_pairs(call.after) if met is None else met.pairs
+    _, force = _pin_forces(with_pairs(call, met))
+    bodies = loaded_bodies(scene, call.after, named_material(call.material)["masses"], about)
+    total, found = _colliders(scene, call, force, bodies)
+    residual = force - total
+    total = total if met is None else total + pairs.on_vertices
+    hands = loaded_colliders(scene, met, about)
+    on_hands = {} if met is None else wrenches(met.forces, hands)
+    stacked = [torch.cat([one.force, one.torque], dim=-1) for one in on_hands.values()]
+    return ContactForces(
+        force=total,
+        residual=residual,
+        bodies=dict([*wrenches(total, bodies).items(), *on_hands.items()]),
+        colliders=found,
+        between=between(scene, met, [*bodies.items(), *hands.items()]),
+        on_colliders=torch.stack(stacked, dim=1) if stacked else total.new_zeros((len(total), 0, 6)),
+        pairs=pairs,
+    )
+
+
+def with_pairs(call: AdjointCall, met: Met | None) -> AdjointCall:
+    """The step with the forces between surfaces among those that are given."""
+    if met is None:
+        return call
+    pushes = met.pairs.on_vertices
+    return replace(call, forces=pushes if call.forces is None else call.forces + pushes)
+
+
+def _colliders(
+    scene: Scene, call: AdjointCall, force: Tensor, bodies: dict[Body, Loaded]
+) -> tuple[Tensor, dict[Ground | Sphere, ContactForce]]:
+    """Forces [B, V, 3] of grounds and spheres that balance a force [B, V, 3], together and of each."""
     colliders: Sequence[Ground | Sphere] = (*scene.grounds, *scene.spheres)
-    bodies = _bodies(scene, call.after, named_material(call.material)["masses"], about)
     if not colliders:
-        none = torch.zeros_like(force)
-        return ContactForces(none, force, _on_bodies(none, bodies), {})
+        return torch.zeros_like(force), {}
     contacts = _contacts(call)
     with torch.no_grad():
         diagonal = step_diagonal(call.plan, call.material, call.time_step)[1]
     pushes, friction, active = _split(contacts, force, diagonal)
     forces = pushes.unsqueeze(-1) * contacts.normals + friction
-    total = _sum_over_contacts(forces)
-    wrenches = _on_bodies(forces, bodies)
+    on_bodies = wrenches(forces, bodies)
     found = {
         part: ContactForce(
             forces[:, k],
             friction[:, k],
             pushes[:, k],
             active[:, k],
-            {solid: Wrench(all_.force[:, k], all_.torque[:, k], all_.about) for solid, all_ in wrenches.items()},
+            {solid: Wrench(all_.force[:, k], all_.torque[:, k], all_.about) for solid, all_ in on_bodies.items()},
         )
         for k, part in enumerate(colliders)
     }
-    return ContactForces(total, force - total, _on_bodies(total, bodies), found)
-
-
-def _on_bodies(forces: Tensor, bodies: dict[Body, _Body]) -> dict[Body, Wrench]:
-    return {solid: _wrench(forces[..., body.rows, :], body.positions, body.about) for solid, body in bodies.items()}
+    return _sum_over_contacts(forces), found
