@@ -56,6 +56,13 @@ def test_single_tet_is_regular_and_centred() -> None:
         (lambda: shapes.box(cells=(1, 2, 0)), r"box\.cells .*numbers"),
         (lambda: shapes.box(cells=(1, 2, 2.5)), r"box\.cells .*numbers"),
         (lambda: shapes.single_tet(0.0), r"single_tet\.edge .*got 0\.0"),
+        (lambda: shapes.sheet((1.0, 0.0)), r"sheet\.size .*got 0\.0"),
+        (lambda: shapes.sheet((1.0, 1.0), (2, 2.5)), r"sheet\.cells .*got 2\.5"),
+        (lambda: shapes.sheet((1.0, 1.0, 1.0)), r"sheet: size and cells .*got \(1\.0, 1\.0, 1\.0\)"),
+        (lambda: shapes.sphere(-1.0), r"sphere\.radius .*got -1\.0"),
+        (lambda: shapes.sphere(1.0, 0), r"sphere\.cells .*got 0"),
+        (lambda: shapes.capsule(1.0, 0.0), r"capsule\.length .*got 0\.0"),
+        (lambda: shapes.cylinder(1.0, 1.0, 1.5), r"cylinder\.cells .*got 1\.5"),
         (lambda: shapes.octopus(arms=2), r"octopus\.arms .*got 2"),
         (lambda: shapes.octopus(cells=20.5), r"octopus\.cells .*got 20\.5"),
     ],
@@ -63,6 +70,69 @@ def test_single_tet_is_regular_and_centred() -> None:
 def test_bad_shapes_are_refused(call, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         call()
+
+
+CLOSED = {
+    "sphere": shapes.sphere,
+    "capsule": lambda radius=1.0, cells=6: shapes.capsule(radius, 3.0 * radius, cells),
+    "cylinder": lambda radius=1.0, cells=4: shapes.cylinder(radius, 3.0 * radius, cells),
+}
+
+
+@pytest.mark.parametrize("cells", [1, 2, 5, 12])
+@pytest.mark.parametrize("name", CLOSED)
+def test_surfaces_of_revolution_are_closed_and_even(name: str, cells: int) -> None:
+    """A sphere by topology, faces outward, no obtuse triangle, and none sharper than 35 degrees."""
+    mesh = CLOSED[name](0.02, cells).to_trimesh()
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.euler_number == 2
+    assert mesh.volume > 0.0
+    angles = np.degrees(mesh.face_angles)
+    assert angles.min() > 35.0
+    assert angles.max() < 90.0 + 1e-6
+
+
+@pytest.mark.parametrize("name", ["sphere", "capsule"])
+def test_round_surfaces_converge(name: str) -> None:
+    """Chords of edges e are short of area and volume by O(e^2): a quarter of the error with half the edges."""
+    volume, area = 4.0 * np.pi / 3.0, 4.0 * np.pi
+    if name == "capsule":
+        volume, area = volume + 3.0 * np.pi, area + 6.0 * np.pi
+    meshes = [CLOSED[name](1.0, cells) for cells in (8, 16)]
+    for of, exact in ((lambda mesh: mesh.volume(), volume), (lambda mesh: mesh.to_trimesh().area, area)):
+        coarse, fine = (exact - of(mesh) for mesh in meshes)
+        assert 0.0 < fine < 0.01 * exact
+        assert coarse / fine == pytest.approx(4.0, rel=0.05)
+
+
+def test_points_of_round_surfaces_are_exact() -> None:
+    ball = shapes.sphere(0.3, 7)
+    np.testing.assert_allclose(np.linalg.norm(ball.vertices, axis=1), 0.3, rtol=1e-14)
+    assert len(ball.triangles) == 8 * 7**2
+    x, y, z = shapes.capsule(0.3, 1.0).vertices.T
+    distance = np.sqrt(x**2 + np.maximum(abs(y) - 0.5, 0.0) ** 2 + z**2)
+    np.testing.assert_allclose(distance, 0.3, rtol=1e-14)
+
+
+def test_a_cylinder_is_a_prism() -> None:
+    """Of n = 6 cells sides: area of the base n / 2 r^2 sin(2 pi / n), of the sides 2 n r sin(pi / n) l."""
+    r, length, n = 0.02, 0.2, 6 * 5
+    mesh = shapes.cylinder(r, length, 5)
+    base = 0.5 * n * r**2 * np.sin(2.0 * np.pi / n)
+    assert mesh.volume() == pytest.approx(base * length, rel=1e-12)
+    assert mesh.to_trimesh().area == pytest.approx(2.0 * base + 2.0 * n * r * np.sin(np.pi / n) * length, rel=1e-12)
+    np.testing.assert_allclose(mesh.bounds[:, 1], [-0.1, 0.1], rtol=1e-15)
+
+
+def test_a_sheet_is_level() -> None:
+    mesh = shapes.sheet((2.0, 0.9), (4, 3))
+    surface = mesh.to_trimesh()
+    assert surface.area == pytest.approx(1.8, rel=1e-14)
+    np.testing.assert_allclose(surface.face_normals, [[0.0, 1.0, 0.0]] * 24, atol=1e-15)
+    assert surface.euler_number == 1
+    for i, k in np.ndindex(5, 4):
+        np.testing.assert_allclose(mesh.vertices[4 * i + k], [0.5 * i - 1.0, 0.0, 0.3 * k - 0.45], atol=1e-15)
 
 
 @pytest.fixture(scope="module")

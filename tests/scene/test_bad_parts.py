@@ -241,6 +241,9 @@ def test_thin_bodies_and_small_spheres_are_said() -> None:
         warnings.simplefilter("error")
         warn_of_scene(pd.Scene(sheet, pd.Sphere((0, -1, 0), 0.36)))
         warn_of_scene(pd.Scene(body(), pd.Sphere((0, -1, 0), 0.01)))
+    # with Contact surfaces of solids are expected to meet it
+    with pytest.warns(SceneWarning, match=r"radius 0\.01 m may meet edges of Solid .*Collider.*sphere\(0\.01\)"):
+        warn_of_scene(pd.Scene(body(), pd.Sphere((0, -1, 0), 0.01), pd.Contact()))
 
 
 def test_sheets_that_float32_cannot_resolve_are_said() -> None:

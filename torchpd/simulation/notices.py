@@ -18,6 +18,7 @@ from ..common.warn import SceneWarning, warn_user
 from ..geometry.overlaps import Overlap, boxes_meet, find_overlaps
 from ..plan.material import CORE_ROWS
 from ..scene.effects import Solid
+from ..scene.part import Body
 from ..scene.scene import Scene
 from .state import HistoryState, State
 
@@ -30,27 +31,35 @@ _INVERTED, _MISSING = 6, 8  # columns of the rows of a report
 
 
 def warn_of_scene(scene: Scene) -> None:
-    """Warn of bodies that overlap at rest, and of spheres that fit through the meshes of sheets and rods."""
+    """Warn of bodies that overlap at rest, and of spheres that fit through the meshes of bodies."""
     _say_small_spheres(scene)
     if len(scene.solids) > 1 and _may_pass(scene):
         _say_overlaps(scene, find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
 
 
 def _say_small_spheres(scene: Scene) -> None:
-    """Only vertices meet a sphere, so that edges longer than its radius may pass through it."""
-    thin = [body for body in scene.bodies if not isinstance(body, Solid)]
-    if not (thin and scene.spheres):
+    """Only vertices meet a sphere, so that edges longer than its radius may pass through it.
+
+    Sheets and rods are looked at, and solids in a scene with `Contact`, from which one expects that surfaces meet.
+    """
+    met = [body for body in scene.bodies if not isinstance(body, Solid) or scene.contact is not None]
+    if not (met and scene.spheres):
         return
-    ends = [body.mesh.vertices[body.elements] for body in thin]
+    ends = [body.mesh.vertices[body.mesh.boundary() if isinstance(body, Solid) else body.elements] for body in met]
     longest = max(float(np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max()) for x in ends)
     radius = min(sphere.radius for sphere in scene.spheres)
     if radius < longest:
         warn_user(
-            f"Simulator: a sphere of radius {radius:.3g} m may meet edges of cloth or rods of up to {longest:.3g} m. "
-            "Only their vertices collide, so a sphere passes through such edges: refine the mesh until edges are "
-            "shorter than the radius",
+            f"Simulator: a sphere of radius {radius:.3g} m may meet edges of {_kinds(met)} of up to {longest:.3g} m. "
+            "Only their vertices collide with a Sphere, which passes through such edges: refine the mesh until edges "
+            f"are shorter than the radius, or take Collider(torchpd.shapes.sphere({radius:.3g})) in a Contact",
             SceneWarning,
         )
+
+
+def _kinds(bodies: list[Body]) -> str:
+    """Kinds of bodies, each once."""
+    return ", ".join(dict.fromkeys(type(body).__name__ for body in bodies))
 
 
 def _say_overlaps(scene: Scene, found: list[Overlap], where: str) -> None:
