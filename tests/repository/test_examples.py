@@ -66,6 +66,34 @@ def test_no_example_is_left_out() -> None:
     assert tested == {path.name for path in EXAMPLES.glob("*.py")}
 
 
+def finger_ends(text: str) -> tuple[list[float], list[float]]:
+    """What the cube carries and holds [N], and heights of the tip [mm]."""
+    forces = numbers(text, r"carries (\S+) N of 4\.9050 N, and holds (\S+) N of 1\.0000 N")
+    return forces, [float(height) for height in re.findall(r"tip at +(\S+) mm", text)]
+
+
+def test_mujoco_finger_without_mujoco(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop with an integrator of its own: the wrench is weight and pull. A light finger hops ever higher."""
+    (carried, held), _ = finger_ends(run("mujoco_finger.py", "--engine", "own", "--steps", "60"))
+    assert carried == pytest.approx(0.5 * 9.81, rel=2e-3)
+    assert held == pytest.approx(1.0, rel=2e-2)
+    text = run("mujoco_finger.py", "--engine", "own", "--steps", "24", "--mass", "0.05", "--damping", "0")
+    assert "too light" in text
+    assert max(float(height) for height in re.findall(r"tip at +(\S+) mm", text)) > 100.0
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(SystemExit, match="pip install mujoco"):
+        run("mujoco_finger.py")
+
+
+def test_mujoco_finger(run) -> None:
+    """MuJoCo's own integrator does the same."""
+    pytest.importorskip("mujoco")
+    there, heights = finger_ends(run("mujoco_finger.py", "--steps", "24"))
+    own, same = finger_ends(run("mujoco_finger.py", "--engine", "own", "--steps", "24"))
+    assert there == pytest.approx(own, abs=1e-3)
+    assert heights == pytest.approx(same, abs=1e-2)
+
+
 @pytest.mark.parametrize("ending", ["glb", "ply"])
 def test_drop_body(run, tmp_path: Path, ending: str) -> None:
     out = tmp_path / f"end.{ending}"
