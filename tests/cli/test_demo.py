@@ -17,6 +17,7 @@ from pxr import Usd
 
 import torchpd as pd
 from torchpd.__main__ import main
+from torchpd.cli.demo import DemoOptions, _place_body, run_demo
 
 STEPS = 24
 
@@ -88,6 +89,20 @@ def test_surfaces_move_in_real_time(demo: tuple[str, Path]) -> None:
     assert stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond() == pytest.approx(STEPS / 60)
     document = pygltflib.GLTF2().load(str(folder / "animation.glb"))
     assert document.accessors[document.animations[0].samplers[0].input].max[0] == pytest.approx(STEPS / 60)
+
+
+def test_arms_of_the_octopus_meet_each_other() -> None:
+    """The demo's octopus is a mesh that `Contact` takes: parts do not touch at rest, at any resolution."""
+    for cells in (12, 16, 24):
+        mesh = _place_body(pd.shapes.octopus(), cells)
+        scene = pd.Scene(pd.Solid(mesh, youngs=3e4, density=1000.0), pd.Contact(friction=0.3))
+        sim = pd.Simulator(scene, 1 / 60, 2, batch=1)
+        sim.check(sim(sim.rest_state()))
+
+
+def test_the_octopus_is_shown_with_contact(tmp_path: Path) -> None:
+    report = run_demo(DemoOptions(cells=12, steps=2, quick=True, out=tmp_path / "out"))
+    assert re.search(r"^contact +ground, and with itself$", report, flags=re.MULTILINE)
 
 
 def test_tetrahedral_mesh_is_taken_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
