@@ -28,8 +28,8 @@ LoadedPairs<T> loaded_pairs_view(at::TensorList pairs, std::int64_t batch, std::
   TORCH_CHECK_VALUE(pairs.size() == arrays, "pairs must have ", arrays, " arrays, got ",
                     pairs.size());
   LoadedPairs<T> view;
-  view.plan = contact_plan_view<T>(pairs.slice(pairs_contact), vertices);
   const Place place{at::kCPU};
+  view.plan = contact_plan_view<T>(pairs.slice(pairs_contact), vertices, place);
   const auto check = [&](LoadedPairsTensor which, at::ScalarType type, at::IntArrayRef shape,
                          const char* meaning) {
     const Tensor& tensor = pairs[which];

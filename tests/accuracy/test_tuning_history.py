@@ -59,5 +59,5 @@ def test_a_plastic_bar_is_tuned() -> None:
 def test_colliders_stay_where_the_state_has_them() -> None:
     sim, plate = dropped()
     pose = torch.tensor([0.0, 0.1, 0.0, 1.0, 0.0, 0.0, 0.0])
-    with pytest.raises(ValueError, match="tune: targets must not move a Collider, .* leave it out"):
+    with pytest.raises(ValueError, match=r"tune: targets must not move a Collider, .* leave it out"):
         sim.tune(error=0.1, targets={plate: pose})

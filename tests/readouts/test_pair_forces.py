@@ -58,21 +58,19 @@ def test_closest_points_of_random_pairs(edges: bool) -> None:
 
 
 def test_sums_by_label() -> None:
-    """In a fixed order: an environment alone, and with more entries that are left out, has the same bits."""
+    """In a fixed order: with other entries, and more that are left out, a sum has the same bits."""
     generator = torch.Generator().manual_seed(0)
-    values = torch.randn(3, 50, 2, generator=generator)
-    labels = torch.randint(0, 8, (3, 50), generator=generator)
-    labels[:, 11::12] = 7  # left out
+    values = torch.randn(150, 2, generator=generator)
+    labels = torch.randint(0, 8, (150,), generator=generator)
     labels[labels == 3] = 2
-    found = sums_by(values, labels, 7)
-    expected = torch.zeros(3, 8, 2).double()
-    for one in range(3):
-        expected[one].index_add_(0, labels[one], values[one].double())
-    torch.testing.assert_close(found.double(), expected[:, :7], rtol=0.0, atol=1e-5)
-    assert not bool(found[:, 3].any())
-    more = torch.nn.functional.pad(values, (0, 0, 0, 90), value=9.0)
-    assert torch.equal(sums_by(more[1:2], torch.nn.functional.pad(labels, (0, 90), value=7)[1:2], 7), found[1:2])
-    assert not bool(sums_by(values[:, :0], labels[:, :0], 7).any())
+    found = sums_by(values, labels, 7, 150)  # 7 is left out
+    expected = torch.zeros(8, 2).double().index_add_(0, labels, values.double())
+    torch.testing.assert_close(found.double(), expected[:7], rtol=0.0, atol=1e-5)
+    assert not bool(found[3].any())
+    chosen = labels >= 4
+    more = torch.nn.functional.pad(values[chosen], (0, 0, 0, 900), value=9.0)
+    assert torch.equal(sums_by(more, torch.nn.functional.pad(labels[chosen], (0, 900), value=7), 7, 150)[4:], found[4:])
+    assert not bool(sums_by(values[:0], labels[:0], 7, 0).any())
 
 
 # ---- statics and closed forms

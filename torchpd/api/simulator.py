@@ -135,7 +135,7 @@ class Simulator(Stepper):
         `TuningWarning`. Files do not keep the result, because times depend on the machine.
 
         The study solves nine steps of each studied environment to convergence, in float64 on the CPU. That takes about
-        a second for a thousand vertices; docs/solvers.md has a table. Friction triples it at most, and `Contact` takes ten
+        a second for a thousand vertices; docs/solvers.md has a table. Friction triples it at most; `Contact` takes ten
         times as long. Where steps with friction or `Contact` do not converge, as for stiff bodies that stick and slip,
         the target counts as not reached. Colliders stay where the state has them.
 

@@ -46,10 +46,21 @@ class PairForces(NamedTuple):
         return by_sizes(self, self.force, "batch", "pairs")
 
 
+class Flat(NamedTuple):
+    """Pairs of all environments in one list; some of them may be no pairs, with zero force."""
+
+    environment: Tensor  # [m]
+    vertices: Tensor  # [m, 4]
+    used: Tensor  # [m] whether it is a pair
+    weights: Tensor  # [m, 4]
+    force: Tensor  # [m, 3] N, on side A
+
+
 class Met(NamedTuple):
     """What surfaces did to each other in a step."""
 
     pairs: PairForces
+    flat: Flat
     places: Tensor  # [B, N, 3] m, of all vertices at the end of the step
     poses: Tensor  # [B, C, 7] of the colliders there
     forces: Tensor  # [B, N, 3] N, on all vertices
@@ -92,7 +103,7 @@ class ContactSurfaces:
         return torch.cat([positions, pose[..., :3] + turned], dim=1)
 
     def corners(self, keys: Tensor) -> tuple[Tensor, Tensor]:
-        """Vertices of pairs [B, P, 4], and whether they are edges [B, P], by keys of pairs, not negative."""
+        """Vertices of pairs [m, 4], and whether they are edges [m], by keys of pairs, not negative."""
         edges = keys >= self.point_keys
         first, triangle = keys // len(self.triangles), keys % len(self.triangles)
         rest = torch.where(edges, keys - self.point_keys, 0)
@@ -122,22 +133,19 @@ class ContactSurfaces:
                 "returned"
             )
 
-    def check_distances(self, vertices: Tensor, distance: Tensor, count: Tensor) -> None:
-        """Refuse forces between surfaces that no step brought together.
+    def check_distances(self, environment: Tensor, vertices: Tensor, distance: Tensor) -> None:
+        """Refuse forces between surfaces that no step brought together, by lists of pairs [m].
 
-        A step lists pairs whose sides may touch before one of them moves a quarter of a mean edge.
+        No vertex leaves a ball of a quarter of its body's mean edge before the next search. Sides of a pair are then at
+        most a mean edge and the thickness apart; twice that edge is refused.
         """
-        if not distance.shape[1]:
-            return
-        used = torch.arange(distance.shape[1], device=count.device) < count[:, None]
-        most = self.cell[vertices].amax(dim=-1) * 2.0 + self.thickness
-        far = torch.where(used, distance.detach() - most, -1.0)
+        far = distance.detach() - (2.0 * self.cell[vertices].amax(dim=-1) + self.thickness)
         if bool((far > 0.0).any()):
-            environment, pair = divmod(int(far.argmax()), distance.shape[1])
+            pair = int(far.argmax())
             raise ValueError(
                 "after.history must be the one that its step left at after.positions, got a force between vertices "
-                f"{vertices[environment, pair].tolist()} of environment {environment}, whose surfaces are "
-                f"{float(distance[environment, pair].detach()):.3g} m apart; give the state that the step returned"
+                f"{vertices[pair].tolist()} of environment {int(environment[pair])}, whose surfaces are "
+                f"{float(distance[pair].detach()):.3g} m apart; give the state that the step returned"
             )
 
 
@@ -158,53 +166,64 @@ def pair_forces(surfaces: ContactSurfaces, positions: Tensor, history: ContactHi
     Raises:
         ValueError: for a history of another scene or step, on the CPU.
     """
-    checks = readable(positions) and readable(history.keys)
-    keys, forces = history.keys, history.forces
-    count = (keys >= 0).sum(dim=1)
-    if checks:
+    used, batch = history.keys >= 0, len(positions)
+    counts = used.sum(dim=1)
+    if values_are_known := readable(positions) and readable(history.keys):
         surfaces.check(history)
-        most = int(count.max()) if len(count) else 0
-        keys, forces = keys[:, :most], forces[:, :most]
-    used = keys >= 0
+        environment, slot = used.nonzero(as_tuple=True)
+        width = int(counts.max()) if batch else 0
+    else:
+        width = used.shape[1]
+        number = torch.arange(batch * width, device=used.device)
+        environment, slot = number // width, number % width
+    used, key, given = (of[environment, slot] for of in (used, history.keys, history.forces))
     places = surfaces.placed(positions, history.poses)
-    vertices, edges = surfaces.corners(keys.clamp(min=0))
-    number = torch.arange(len(places), device=places.device)[:, None, None]
-    corner = places[number, vertices].double()
-    weights, diff = closest_points(edges, corner)
+    count = places.shape[1]
+    vertices, edges = surfaces.corners(key.clamp(min=0))
+    weights, diff = closest_points(edges, places[environment[:, None], vertices].double())
     distance = length(diff)
-    if checks:
-        surfaces.check_distances(vertices, distance, count)
-    normals = diff / torch.where(distance > 0.0, distance, 1.0)[..., None]
-    force = torch.where(used[..., None], forces[..., :1] * normals + forces[..., 1:], 0.0)
-    weights, normals = (torch.where(used[..., None], of, 0.0) for of in (weights, normals))
-    entries = (weights[..., None] * force[..., None, :]).flatten(1, 2)
-    on_all = sums_by(entries, torch.where(used[..., None], vertices, places.shape[1]).flatten(1), places.shape[1])
-    vertices = torch.where(used[..., None], vertices, -1)
+    if values_are_known:
+        surfaces.check_distances(environment, vertices, distance)
+    normals = diff / torch.where(distance > 0.0, distance, 1.0)[:, None]
+    force = torch.where(used[:, None], given[:, :1] * normals + given[:, 1:], 0.0)
+    entries = (weights[..., None] * force[:, None]).flatten(0, 1)
+    labels = torch.where(used[:, None], environment[:, None] * count + vertices, batch * count)
+    on_all = sums_by(entries, labels.flatten(), batch * count, 4 * width).reshape(batch, count, 3)
     weights, normals, force, on_all = (of.to(positions.dtype) for of in (weights, normals, force, on_all))
-    pairs = PairForces(vertices, weights, normals, force, count, on_all[:, : positions.shape[1]])
-    return Met(pairs, places, history.poses, on_all, surfaces.body)
+
+    def padded(values: Tensor, fill: int = 0) -> Tensor:
+        empty = torch.full((batch, width, values.shape[-1]), fill, dtype=values.dtype, device=values.device)
+        return empty.index_put((environment, slot), torch.where(used[:, None], values, fill))
+
+    by_pair = padded(vertices, -1), padded(weights), padded(normals), padded(force)
+    pairs = PairForces(*by_pair, counts=counts, on_vertices=on_all[:, : positions.shape[1]])
+    return Met(pairs, Flat(environment, vertices, used, weights, force), places, history.poses, on_all, surfaces.body)
 
 
-def sums_by(values: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Sums [B, count, k] of values [B, n, k] with labels [B, n]; other labels than 0 .. count - 1 are left out.
+def sums_by(values: Tensor, labels: Tensor, count: int, longest: int) -> Tensor:
+    """Sums [count, k] of values [n, k] with labels [n]; other labels than 0 .. count - 1 are left out.
 
     Values are sorted by label and added by doubling distances, so a sum depends on its own entries alone.
+
+    Args:
+        values: to add.
+        labels: of the values.
+        count: of the sums.
+        longest: most values of a label below `count`.
     """
-    if not labels.shape[1]:
-        return values.new_zeros((len(values), count, values.shape[-1]))
-    labels, order = labels.sort(dim=1, stable=True)
-    values = values.gather(1, order[..., None].expand_as(values))
-    shift = 1
-    while shift < labels.shape[1]:
-        same = (labels[:, shift:] == labels[:, :-shift])[..., None]
-        added = values[:, shift:] + torch.where(same, values[:, :-shift], 0.0)
-        values = torch.cat([values[:, :shift], added], dim=1)
+    if not len(labels):
+        return values.new_zeros((count, values.shape[-1]))
+    labels, order = labels.sort(stable=True)
+    values, shift = values[order], 1
+    while shift < min(longest, len(labels)):
+        same = (labels[shift:] == labels[:-shift]) & (labels[shift:] < count)
+        if readable(labels) and not bool(same.any()):
+            break
+        values = torch.cat([values[:shift], values[shift:] + torch.where(same[:, None], values[:-shift], 0.0)])
         shift *= 2
-    wanted = torch.arange(count, device=labels.device).expand(len(labels), count).contiguous()
+    wanted = torch.arange(count, device=labels.device)
     last = (torch.searchsorted(labels, wanted, right=True) - 1).clamp(min=0)
-    found = labels.gather(1, last) == wanted
-    last = last[..., None].expand(-1, -1, values.shape[-1])
-    return torch.where(found[..., None], values.gather(1, last), 0.0)
+    return torch.where((labels[last] == wanted)[:, None], values[last], 0.0)
 
 
 # ---- closest points

@@ -108,23 +108,24 @@ def between(
     """
     if met is None or scene.contact is None:
         return {}
-    count, pairs = len(parts), met.pairs
+    count, flat = len(parts), met.flat
     about = torch.stack([loaded.about for _, loaded in parts], dim=1)
-    vertices, number = pairs.vertices.clamp(min=0), torch.arange(len(about), device=about.device)[:, None]
-    corners = met.places[number[..., None], vertices]
-    first, second = (met.body.long()[vertices[..., corner]] for corner in (0, 3))
-    counts = (pairs.vertices[..., 0] >= 0) & (first != second)
+    environment, batch = flat.environment, len(about)
+    corners = met.places[environment[:, None], flat.vertices]
+    first, second = (met.body.long()[flat.vertices[:, corner]] for corner in (0, 3))
+    counts = flat.used & (first != second)
     entries, labels = [], []
     for sign, on, by in ((1.0, first, second), (-1.0, second, first)):
         # weights of side A are positive, those of side B negative
-        point = tree_sum((sign * pairs.weights).clamp(min=0.0)[..., None] * corners)
-        force = sign * pairs.force
-        torque = torch.linalg.cross(point - about[number, on], force)
+        point = tree_sum((sign * flat.weights).clamp(min=0.0)[..., None] * corners)
+        force = sign * flat.force
+        torque = torch.linalg.cross(point - about[environment, on], force)
         entries.append(torch.cat([force, torque], dim=-1).double())
-        labels.append(torch.where(counts, on * count + by, count**2))
+        labels.append(torch.where(counts, (environment * count + on) * count + by, batch * count**2))
     # side by side, so that both orders of two parts add up the same
-    values, rows = torch.stack(entries, dim=2).flatten(1, 2), torch.stack(labels, dim=2).flatten(1, 2)
-    sums = sums_by(values, rows, count**2).to(about.dtype)
+    values, rows = torch.stack(entries, dim=1).flatten(0, 1), torch.stack(labels, dim=1).flatten()
+    sums = sums_by(values, rows, batch * count**2, 2 * met.pairs.force.shape[1])
+    sums = sums.to(about.dtype).reshape(batch, count**2, 6)
     named = scene.contact.bodies
     taking = [(part, number) for number, (part, _) in enumerate(parts) if not named or part in named]
     return {
