@@ -1,5 +1,6 @@
-// Shares of ways: of what moves by hand, colliders along their screws and pins of bodies along straight ways, and of whole
-// bodies at the start of a step. Each takes the largest share of its way that is allowed.
+// Shares of ways: of what moves by hand, colliders along their screws and pins of bodies along
+// straight ways, and of whole bodies at the start of a step. Each takes the largest share of its
+// way that is allowed.
 #pragma once
 #include "contact/pairs/pair.h"
 #include "math/screw.h"
@@ -46,8 +47,9 @@ PD_HD Vec3<T> local_point(const ContactPlan<T>& plan, int vertex) {
   return {p[0], p[1], p[2]};
 }
 
-// A direction with the largest gap at both ends, and the gap that must be kept along it: the floor, or the gap at the start
-// where that is less. If no direction has it at both ends, the one with the largest gap at the start is taken.
+// A direction with the largest gap at both ends, and the gap that must be kept along it: the floor,
+// or the gap at the start where that is less. If no direction has it at both ends, the one with the
+// largest gap at the start is taken.
 template <class T>
 struct Kept {
   Vec3<T> normal;
@@ -87,8 +89,8 @@ PD_HD Kept<T> direction_of(const ContactPair<T>& pair, const Vec3<T> (&start)[4]
   return {lower >= least ? both : own, least};
 }
 
-// Whether the parts of a pair stay apart along straight ways from `start` to `end`. `reach`: of its vertices, by how much
-// their ways differ from a rigid motion.
+// Whether the parts of a pair stay apart along straight ways from `start` to `end`. `reach`: of its
+// vertices, by how much their ways differ from a rigid motion.
 template <class T, class Reach>
 PD_HD bool stays_apart(const ContactPair<T>& pair, const Vec3<T> (&start)[4],
                        const Vec3<T> (&end)[4], const Reach& reach, T thickness) {

@@ -1,7 +1,7 @@
 // Entry points of contact between bodies: the tasks of solver/contact/step.h, a launch each for all environments.
 //
-// Arrays are raw, since every target has types of its own and this part is compiled once. Vertices of the step have four
-// numbers each: x, y, z, and the fourth of cuda/common/vertices.h.
+// Arrays are raw, since every target has types of its own and this part is compiled once. Vertices
+// of the step have four numbers each: x, y, z, and the fourth of cuda/common/vertices.h.
 #pragma once
 #include "contact/views.h"
 #include "cuda/common/launch.h"

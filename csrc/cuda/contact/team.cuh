@@ -25,8 +25,8 @@ class ContactTeam {
     spread(count, item);
     barrier();
   }
-  // The lanes of a warp step through the tree together. What they find waits in a queue, until there is something to visit
-  // for every lane.
+  // The lanes of a warp step through the tree together. What they find waits in a queue, until
+  // there is something to visit for every lane.
   template <class Start, class Visit>
   PD_DEVICE void walk(std::int64_t count, const Start& start, const Visit& visit) const {
     const int lane = int(threadIdx.x) % warp_size;

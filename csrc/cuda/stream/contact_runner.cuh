@@ -1,5 +1,5 @@
-// A step with contact between bodies: the passes of kernel `stream` find the free iterate, the tasks of cuda/contact do the
-// rest.
+// A step with contact between bodies: the passes of kernel `stream` find the free iterate, the
+// tasks of cuda/contact do the rest.
 #pragma once
 #include "cuda/contact/launch.h"
 #include "cuda/stream/runner.cuh"
@@ -42,8 +42,8 @@ ContactWork<T> contact_work(const StreamCall<T>& call, const ContactCall<T>& con
   return work;
 }
 
-// The same call without a tolerance: passes write the free iterate in place of the one before, and environments that are done
-// keep theirs.
+// The same call without a tolerance: passes write the free iterate in place of the one before, and
+// environments that are done keep theirs.
 template <class T>
 StreamCall<T> without_tolerance(const StreamCall<T>& call) {
   StreamCall<T> own = call;

@@ -1,11 +1,12 @@
 // The start of a step: whole bodies move first, each by a common share of its way.
 //
-// A body takes the straight way of its velocities, if its parts stay apart all along. Else a body without pins takes its
-// rigid motion, an affine map that folds nothing. Colliders take their screws. First, bodies that may meet go together by one
-// share, so that what moves alike does not hinder itself. Then each goes on alone, by the share that planes allow.
+// A body takes the straight way of its velocities, if its parts stay apart all along. Else a body
+// without pins takes its rigid motion, an affine map that folds nothing. Colliders take their
+// screws. First, bodies that may meet go together by one share, so that what moves alike does not
+// hinder itself. Then each goes on alone, by the share that planes allow.
 //
-// Pairs are not stored: each lowers the shares of its bodies to what it allows. A share is then tried by all pairs again,
-// until none lowers it.
+// Pairs are not stored: each lowers the shares of its bodies to what it allows. A share is then
+// tried by all pairs again, until none lowers it.
 #pragma once
 #include "solver/contact/search.h"
 
@@ -134,8 +135,8 @@ class ContactApproach {
     });
   }
 
-  // Bodies whose parts stay apart along their ways. A rigid motion shortens no distance, so only pairs within reach of the
-  // rest of the ways can meet.
+  // Bodies whose parts stay apart along their ways. A rigid motion shortens no distance, so only
+  // pairs within reach of the rest of the ways can meet.
   template <class Team>
   PD_HD void find_unfolded(const Team& team) const {
     team.each(plan_.vertices, [&](int v) {
@@ -184,8 +185,9 @@ class ContactApproach {
     return side + T(0.5) * plan_.thickness;
   }
 
-  // Calls visit(pair, last) for pairs of different bodies that may meet on the way from the places to the ends, round after
-  // round, while it lowers shares. Bodies of a group have one share, `limit` at the start of a round.
+  // Calls visit(pair, last) for pairs of different bodies that may meet on the way from the places
+  // to the ends, round after round, while it lowers shares. Bodies of a group have one share,
+  // `limit` at the start of a round.
   template <class Team, class Visit>
   PD_HD void each_between(const Team& team, T* shares, const Visit& visit) const {
     ContactNumbers& numbers = env_.numbers();

@@ -1,7 +1,7 @@
 // The contact of one environment while its step runs, for a team of threads that shares its phases.
 //
-// A phase calls a function for every item: vertex, pair, part of a surface, body. Items of a phase do not depend on each
-// other, so any number of threads has the same bits. A team offers
+// A phase calls a function for every item: vertex, pair, part of a surface, body. Items of a phase
+// do not depend on each other, so any number of threads has the same bits. A team offers
 //
 //   spread(count, item)    a phase; each(count, item): and a barrier, after which all see what it wrote
 //   once(task)             one thread, and a barrier

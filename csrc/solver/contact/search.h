@@ -1,5 +1,6 @@
-// The search of pairs: static trees of boxes with 32 children a node, made anew from their leaves. A thread takes the parts
-// of a surface that may be first in a pair. Pairs are counted, placed by prefix sums, and lie in the order of their keys.
+// The search of pairs: static trees of boxes with 32 children a node, made anew from their leaves.
+// A thread takes the parts of a surface that may be first in a pair. Pairs are counted, placed by
+// prefix sums, and lie in the order of their keys.
 #pragma once
 #include "solver/contact/environment.h"
 
@@ -146,9 +147,10 @@ class ContactSearch {
                                : pair_of_edges(plan, owner - plan.points, other);
   }
 
-  // Lists the pairs that may come near while no vertex leaves its ball. A ball reaches over what its vertex wants and the
-  // thickness. Where that is less than half of the room to the nearest other side, it takes that: no pair more is listed.
-  // Forces are those of the list before, or of the history in a `first` search.
+  // Lists the pairs that may come near while no vertex leaves its ball. A ball reaches over what
+  // its vertex wants and the thickness. Where that is less than half of the room to the nearest
+  // other side, it takes that: no pair more is listed. Forces are those of the list before, or of
+  // the history in a `first` search.
   template <class Team>
   PD_HD void find(const Team& team, bool first) const {
     const ContactPlan<T>& plan = env_.plan;
@@ -269,7 +271,8 @@ class ContactSearch {
     return {f[0], {f[1], f[2], f[3]}};
   }
 
-  // Entries of every vertex in the order of the pairs: each finds its place among those of its vertex. `cursor`: their numbers
+  // Entries of every vertex in the order of the pairs: each finds its place among those of its
+  // vertex. `cursor`: their numbers
   template <class Team>
   PD_HD void index(const Team& team, int count) const {
     const ContactArrays<T>& a = env_.a;

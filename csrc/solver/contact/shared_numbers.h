@@ -1,5 +1,6 @@
-// Numbers that several threads of an environment change at a time. The result depends on no order: counts, and the least or
-// largest of numbers that are not negative, whose bits are ordered as integers. On the host one thread runs alone.
+// Numbers that several threads of an environment change at a time. The result depends on no order:
+// counts, and the least or largest of numbers that are not negative, whose bits are ordered as
+// integers. On the host one thread runs alone.
 #pragma once
 #include "math/scalar.h"
 

@@ -1,6 +1,7 @@
 // One step with contact between bodies, for a team: what lies between the passes over elements. A runner calls
 //
-//   start; [coarse correction] go_first; for k: [free iterate, energy] iterate(k); [coarse correction] go_last; finish; write
+//   start; [coarse correction] go_first; for k: [free iterate, energy] iterate(k);
+//   [coarse correction] go_last; finish; write
 #pragma once
 #include "solver/contact/approach.h"
 
@@ -106,8 +107,9 @@ class ContactSteps {
     go(team, false, none);
   }
 
-  // An iteration of a step, from the free iterate without contact. `energy`: E at the iterate, if the schedule checks it.
-  // `sums`: squares of the change, and of the displacement from the target, with a tolerance.
+  // An iteration of a step, from the free iterate without contact. `energy`: E at the iterate, if
+  // the schedule checks it. `sums`: squares of the change, and of the displacement from the target,
+  // with a tolerance.
   struct Iteration {
     T c;  // theta omega
     bool guards, measures;
@@ -174,8 +176,8 @@ class ContactSteps {
     });
   }
 
-  // Poses, forces and numbers of the contact, for the caller. An overflow takes the step back: then nothing has changed, and
-  // no force acts. `next`: the history of this environment.
+  // Poses, forces and numbers of the contact, for the caller. An overflow takes the step back: then
+  // nothing has changed, and no force acts. `next`: the history of this environment.
   struct Output {
     T* poses;
     std::int64_t* keys;
@@ -393,8 +395,8 @@ class ContactSteps {
               [&](int n) { watch_vertex(plan_.body_vertices + n); });
   }
 
-  // Before the move of iteration k: a search if a vertex wants to leave its ball, else planes that targets violate are made
-  // anew at the present iterate. Searches pause while pairs have forces.
+  // Before the move of iteration k: a search if a vertex wants to leave its ball, else planes that
+  // targets violate are made anew at the present iterate. Searches pause while pairs have forces.
   template <class Team>
   PD_HD void prepare(const Team& team, int k) const {
     ContactNumbers& numbers = env_.numbers();
