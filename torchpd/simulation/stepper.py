@@ -283,7 +283,8 @@ class Stepper(Readable):
         self._notices.before(self, state, material, self.time_step, report=report)
         if self.keeps_history:
             after, rows = self._stepped(state, forces, None, material, poses, inertial=inertial, report=report)
-            return tuple(array[None][:steps] for array in (after[0], after[1], rows, *after[2]))
+            taken = tuple(array[None] for array in (after[0], after[1], rows, *after[2]))
+            return taken if steps else tuple(array[:0] for array in taken)
         # the adjoint needs every state, so the op has a derivative only with every=1
         thinned = every > 1 and torch.is_grad_enabled() and _requires_grad(state[0], state[1], forces, *material)
         found = _ops.rollout(
