@@ -1,4 +1,4 @@
-"""Coarse corrections of bodies in contact: momentum and motion after few iterations, and converged steps as they are."""
+"""Coarse corrections of bodies in contact: momentum and motion after few iterations, and converged steps."""
 
 from __future__ import annotations
 

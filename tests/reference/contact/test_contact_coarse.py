@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from torchpd.reference.contact.coarse import BOW, RigidWay, changed_forces
 from torchpd.reference.envelopes import Envelopes
 

@@ -277,14 +277,16 @@ class _Run:
                 chords[torch.as_tensor(way.vertices)] = torch.as_tensor(way.chords).to(x.dtype)
             here = places
 
-            def after(share: float) -> Tensor:
+            def after(share: float, here: Tensor = here, ways: list[RigidWay] = ways) -> Tensor:
                 out = here.clone()
                 for way in ways:
                     own = torch.as_tensor(way.vertices)
                     out[own] = torch.as_tensor(way.at(share)).to(x.dtype)
                 return out
 
-            share, leaves = share_of(scene.surfaces, component, None if swept else contacts, here, after, chords, moving)
+            share, leaves = share_of(
+                scene.surfaces, component, None if swept else contacts, here, after, chords, moving
+            )
             self.shares.append(share)
             swept |= leaves
             places = after(share) if share > 0.0 else here
