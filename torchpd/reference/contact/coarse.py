@@ -133,7 +133,7 @@ class RigidWay:
         x, y, z = share * self.turn
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         turn = (cross + 0.5 * cross @ cross) / (1.0 + 0.25 * share**2 * float(self.turn @ self.turn))
-        return self.center + share * self.shift + self.arms + self.arms @ turn.T
+        return np.asarray(self.center + share * self.shift + self.arms + self.arms @ turn.T)
 
 
 def share_of(
