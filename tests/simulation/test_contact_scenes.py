@@ -108,21 +108,26 @@ def test_a_block_sticks_on_a_slope(iterations: int) -> None:
     assert float(state.velocities.norm(dim=-1).max()) < 1e-5
 
 
+@pytest.mark.parametrize("iterations", [16, 64])
 @pytest.mark.parametrize(("degrees", "friction"), [(30.0, 0.5), (20.0, 0.3)])
-def test_a_block_slides_down_a_slope(degrees: float, friction: float) -> None:
-    """k h g (sin a - mu cos a) after k steps, and at most 3 % more: parts stick at first."""
+def test_a_block_slides_down_a_slope(degrees: float, friction: float, iterations: int) -> None:
+    """k h g (sin a - mu cos a) after k steps, and at most 3 % more: parts stick at first.
+
+    Without coarse corrections it has half of that with 16 iterations.
+    """
     course = slope(degrees, friction)
-    sim = simulator(course.scene, 64)
+    sim = simulator(course.scene, iterations)
     state, _ = course.last(sim, 30)
     angle = math.radians(degrees)
     rigid = 30 * H * G * (math.sin(angle) - friction * math.cos(angle))
     assert rigid < float(mean(sim, state.velocities).norm()) < 1.03 * rigid
 
 
-def test_a_block_slides_to_a_stop() -> None:
+@pytest.mark.parametrize("iterations", [64, 128])
+def test_a_block_slides_to_a_stop(iterations: int) -> None:
     """2 m/s, friction .4: 2 - 30 h mu g = .038 m/s after 30 steps, on a way of sum h (2 - k h mu g)."""
     course = slope(0.0, 0.4, speed=2.0)
-    sim = simulator(course.scene, 128)
+    sim = simulator(course.scene, iterations)
     start = mean(sim, sim.rest_state().positions)
     state, _ = course.last(sim, 30)
     rigid = [2.0 - k * H * 0.4 * G for k in range(1, 31)]

@@ -244,7 +244,7 @@ def correct(
         forces: [C, V, 3] N of every plane and sphere at the iterate, see `pushes_of`.
         pairs: contacts between bodies, with their forces at the iterate.
         motions: makes the motions of an island.
-        push_pairs: whether pairs push their vertices after the motion. An iteration with their multipliers does it, too.
+        push_pairs: whether pairs push their vertices after the motion; an iteration with multipliers does it, too.
         passes: most states of an island with pairs at which Phi is looked at.
     """
     corrected, after = displacement.copy(), np.zeros((0, 3)) if pairs is None else pairs.forces.copy()
@@ -272,8 +272,9 @@ def islands(
     ends = np.zeros((0, 2), np.int64) if pairs is None else component[pairs.vertices[:, [0, 3]]]
     of = [np.flatnonzero(component == body) for body in range(int(component.max()) + 1)]
     # those of pairs alone: which other bodies move does not matter
-    moves = np.array([not (ends == n).any() or motions(problem, still, (body,)).modes.shape[2] > 0
-                      for n, body in enumerate(of)])
+    moves = np.array(
+        [not (ends == n).any() or motions(problem, still, (body,)).modes.shape[2] > 0 for n, body in enumerate(of)]
+    )
     both = ends[moves[ends].all(axis=1)]
     links = coo_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(len(of), len(of)))
     number = connected_components(links, directed=False)[1]

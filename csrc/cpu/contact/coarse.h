@@ -14,7 +14,8 @@ namespace pd::inline PD_TARGET {
 
 // Of the chord of a turn up to a right angle: how far a share of it leaves the straight way.
 constexpr double turn_bow = 0.25;
-constexpr int coarse_halvings = 6;  // of the interval of a share: another motion follows one that is cut
+constexpr int coarse_halvings =
+    6;  // of the interval of a share: another motion follows one that is cut
 
 template <class T>
 class CoarseContact {
@@ -96,7 +97,7 @@ class CoarseContact {
                               });
         }
       }
-      island_.pass([&](int n) -> const double(&)[ContactSums::count] {
+      island_.pass([&](int n) -> const double (&)[ContactSums::count] {
         return w.body_sums[bodies_[root][n]].contact;
       });
     }
@@ -215,7 +216,8 @@ class CoarseContact {
     }
     each_moving(w, root, [&](int i, int v) {
       const CoarseVertex<double> at = coarse_vertex(w, i);
-      const auto u = w.u[i] + Lanes::value(narrow(motion_[plan_.vertex_component[i]].of(at.x + at.u)));
+      const auto u =
+          w.u[i] + Lanes::value(narrow(motion_[plan_.vertex_component[i]].of(at.x + at.u)));
       next_[v] = Lanes::vec3(w.x[i] + u);
     });
   }
@@ -249,7 +251,8 @@ class CoarseContact {
       const auto reach = [&](int v) {
         if (!moves_[v]) return T(0.5) * contact_.thickness;
         const RigidMotion<double>& motion = motion_of(component_[v]);
-        return T(turn_bow * length(motion_[component_[v]].turn * (wide(places[v]) - motion.center))) +
+        return T(turn_bow *
+                 length(motion_[component_[v]].turn * (wide(places[v]) - motion.center))) +
                T(0.5) * contact_.thickness;
       };
       run.near().each_meeting(
@@ -283,7 +286,7 @@ class CoarseContact {
   const Plan<T>& plan_;
   std::vector<int> inside_, component_;  // of the user's vertices: internal number; component
   std::vector<std::vector<int>> members_, bodies_, pairs_;  // of components; of islands by root
-  std::vector<int> local_, root_;        // of components: number in the island; a step to the root
+  std::vector<int> local_, root_;  // of components: number in the island; a step to the root
   std::vector<RigidMotion<double>> motion_;  // of components: a share
   CoarseIsland island_;
   Places next_;

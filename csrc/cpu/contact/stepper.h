@@ -7,7 +7,7 @@ namespace pd::inline PD_TARGET {
 
 constexpr int coarse_pause = 8;  // iterations between coarse corrections
 constexpr int coarse_trials = 4;
-constexpr int coarse_last = 2;   // iterations before the last one, in which none comes
+constexpr int coarse_last = 2;  // iterations before the last one, in which none comes
 
 // `HasContacts`: with planes and spheres of the scene, see solver/vertex.h.
 template <class T, bool HasContacts>
@@ -199,9 +199,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
 
   // What planes and spheres push after the whole motion of a body.
   Vec3<T> wall_push(int i) const {
-    const auto narrowed = [](const Vec3<double>& a) {
-      return Vec3<T>{T(a.x), T(a.y), T(a.z)};
-    };
+    const auto narrowed = [](const Vec3<double>& a) { return Vec3<T>{T(a.x), T(a.y), T(a.z)}; };
     if constexpr (HasContacts) {
       const Value moved = vertex(i).displaced(w_.u[i], narrowed(coarse_.way(w_, i)));
       CoarseVertex<double> v = coarse_vertex(w_, i);
@@ -354,7 +352,8 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   std::int64_t environment_;
   // displacements of the next iterate before contact; and of this one and the last before a correction. A Quad is aligned
   // more than std::vector grants
-  std::vector<Vec3<T>> free_ = std::vector<Vec3<T>>(plan_.vertices), old_ = free_, previous_ = free_;
+  std::vector<Vec3<T>> free_ = std::vector<Vec3<T>>(plan_.vertices), old_ = free_,
+                       previous_ = free_;
   std::vector<char> touches_;    // [components]
   std::vector<Vec3<T>> forces_;  // of contact, on every vertex
   double residual_ = 0;

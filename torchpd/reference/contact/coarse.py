@@ -1,7 +1,7 @@
 """Coarse correction of bodies in contact: rigid motions that the listed pairs join, as far as other bodies let them.
 
-The motions minimise the energy of `reference.coarse`, with the augmented Lagrangian of the pairs between bodies as their
-envelopes: 1 / k = sum w^2 / D, gap = d - r, anchored at the multipliers. An island, the bodies that pairs join, goes
+The motions minimise the energy of `reference.coarse`. The envelopes of the pairs between bodies are their augmented
+Lagrangian: 1 / k = sum w^2 / D, gap = d - r, anchored at the multipliers. An island, the bodies that pairs join, goes
 by one common share of its motion, else it would lose momentum. A share turns each body about its axis by less, so that
 no distance within a body changes: pairs of a body with itself bound nothing.
 
@@ -133,7 +133,7 @@ class RigidWay:
         x, y, z = share * self.turn
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         turn = (cross + 0.5 * cross @ cross) / (1.0 + 0.25 * share**2 * float(self.turn @ self.turn))
-        return self.center + share * self.shift + self.arms + self.arms @ turn.T
+        return np.asarray(self.center + share * self.shift + self.arms + self.arms @ turn.T)
 
 
 def share_of(

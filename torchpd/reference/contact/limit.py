@@ -193,9 +193,7 @@ def largest_shares(
     return halved(allowed, held, balls.radii.dtype)
 
 
-def halved(
-    allowed: Callable[[Tensor], Tensor], held: Tensor, dtype: torch.dtype, halvings: int = _HALVINGS
-) -> Tensor:
+def halved(allowed: Callable[[Tensor], Tensor], held: Tensor, dtype: torch.dtype, halvings: int = _HALVINGS) -> Tensor:
     """Largest shares [n] in [0, 1] that are `allowed`, by halving; 0 of what is `held` [n]."""
     least, most = torch.zeros(len(held), dtype=dtype), torch.ones(len(held), dtype=dtype)
     whole = allowed(most) & ~held

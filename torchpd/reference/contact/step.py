@@ -277,14 +277,16 @@ class _Run:
                 chords[torch.as_tensor(way.vertices)] = torch.as_tensor(way.chords).to(x.dtype)
             here = places
 
-            def after(share: float) -> Tensor:
+            def after(share: float, here: Tensor = here, ways: list[RigidWay] = ways) -> Tensor:
                 out = here.clone()
                 for way in ways:
                     own = torch.as_tensor(way.vertices)
                     out[own] = torch.as_tensor(way.at(share)).to(x.dtype)
                 return out
 
-            share, leaves = share_of(scene.surfaces, component, None if swept else contacts, here, after, chords, moving)
+            share, leaves = share_of(
+                scene.surfaces, component, None if swept else contacts, here, after, chords, moving
+            )
             self.shares.append(share)
             swept |= leaves
             places = after(share) if share > 0.0 else here
@@ -297,10 +299,10 @@ class _Run:
                 each = at.forces(chosen.friction * at.normal_forces())
             else:
                 each = changed_forces(pair_envelopes(problem, chosen, u), moved.forces[of])
-            each = torch.as_tensor(each).to(x.dtype)
+            force = torch.as_tensor(each).to(x.dtype)
             n = torch.as_tensor(chosen.normals).to(x.dtype)
-            normal[index] = (each * n).sum(dim=1)
-            tangential[index] = each - normal[index, None] * n
+            normal[index] = (force * n).sum(dim=1)
+            tangential[index] = force - normal[index, None] * n
         held = Multipliers(normal.clamp(min=0.0), tangential)
         self.keys, self.known = contacts.pairs.keys, held
         self.current, self.contacts, self.checked = places, replace(contacts, held=held), None
