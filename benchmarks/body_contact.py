@@ -66,7 +66,21 @@ def milliseconds(parts: list[Any], steps: int) -> tuple[float, pd.Simulator]:
     return (time.perf_counter() - begin) / steps * 1e3, sim
 
 
-def measure(name: str, cells: int, steps: int) -> Row:
+def backward_milliseconds(sim: pd.Simulator, steps: int) -> float:
+    """Time of the gradient of a step by its state, on the way of `milliseconds`."""
+    state: Any = sim.rollout(sim.rest_state(), SETTLES, every=SETTLES).state()
+    spent = 0.0
+    for _ in range(steps):
+        x, v = state.positions.requires_grad_(), state.velocities.requires_grad_()
+        after: Any = sim(state)
+        begin = time.perf_counter()
+        torch.autograd.grad(after.positions.square().sum() + after.velocities.sum(), (x, v))
+        spent += time.perf_counter() - begin
+        state = pd.HistoryState(after.positions.detach(), after.velocities.detach(), after.history)
+    return spent / steps * 1e3
+
+
+def measure(name: str, cells: int, steps: int, *, gradients: bool) -> Row:
     parts = SCENES[name](cells)
     without, _ = milliseconds([part for part in parts if not isinstance(part, pd.Collider)], steps)
     contact = pd.Contact(friction=0.4, thickness=min(THICKNESS, 0.02 / cells))
@@ -80,6 +94,9 @@ def measure(name: str, cells: int, steps: int) -> Row:
         "milliseconds": with_contact,
         "milliseconds_without": without,
     }
+    if gradients:
+        row["milliseconds_backward"] = backward_milliseconds(sim, steps)
+        print(f"{row['milliseconds_backward']:8.2f} ms backward ", end="")
     print(
         f"{name:<8}{row['vertices']:8} vertices{row['triangles']:8} triangles{with_contact:10.2f} ms, {without:.2f} ms "
         "without",
@@ -93,9 +110,14 @@ def main() -> None:
     parser.add_argument("--cells", type=int, nargs="+", default=[4, 8], help="of a cube along an edge")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--steps", type=int, default=40, help="that are timed, after 20 others")
+    parser.add_argument("--gradients", action="store_true", help="also of a step by its state")
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()
-    rows = [measure(name, cells, options.steps) for name in options.scenes for cells in options.cells]
+    rows = [
+        measure(name, cells, options.steps, gradients=options.gradients)
+        for name in options.scenes
+        for cells in options.cells
+    ]
     if options.out:
         write_result(options.out, {**describe_run(torch.device("cpu"), torch.get_num_threads()), "rows": rows})
 

@@ -84,10 +84,48 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
         "adjoint_result": (
             (f, errors, direction, material, f, direction, projector, x[..., 0] > 0.1, sliding), h,
         ),
+        **samples_of_contact(x),
         "adjoint_fallback": ((direction, errors, 0 * errors, still, f, 1 / inertia, None, material, plan), h),
     }  # fmt: skip
 
 
+def samples_of_contact(x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
+    """Arguments of the ops of a step with contact between bodies, on the CPU."""
+    if x.is_cuda:
+        return {}
+    mesh = pd.shapes.box((0.1,) * 3, (1,) * 3)
+    cubes = [pd.Solid(mesh.translated((0.01 * n, 0.102 * n, 0.0)), youngs=1e5, density=1000.0) for n in range(2)]
+    sim = pd.Simulator(pd.Scene(*cubes, pd.Contact(friction=0.3, thickness=1e-3)), dtype=x.dtype, progress=False)
+    assert sim.body_contact is not None
+    state: Any = sim.rest_state(BATCH)
+    state.velocities[:, 8:, 1] = -0.5
+    material, plan, contact = sim.material(), plan_of(sim), sim.body_contact.arrays
+    poses, keys, forces, _ = state.history
+    taken = torch.ops.torchpd.contact_step(
+        *state[:2], None, poses, [poses, keys, forces], material, plan, contact, **settings_of(sim)
+    )
+    after, numbers, actual, keys, forces, pushes = (taken[place] for place in (0, 3, 5, 6, 7, 8))
+    f, h = noise(state.positions), {"time_step": sim.time_step}
+    pairs = [state.positions, after, poses, actual, keys, forces, *contact]
+    inertia = (sim.masses / sim.time_step**2).detach()
+    trained = [array.clone().requires_grad_() if array.is_floating_point() else array for array in contact]
+    moving = [array.detach().clone().requires_grad_() for array in state[:2]]
+    solve = (after, f, inertia, 1.0 / (inertia + 1e4), None, material, plan, None, None, pairs)
+    history, back = [poses, actual, keys, forces], numbers[:, 1] > 0
+    errors = torch.tensor([0.0, 2.0, 1.0], dtype=torch.float64)
+    return {
+        "contact_step": (
+            (*moving, None, poses, [poses, *state.history[1:3]], material, plan, trained), settings_of(sim),
+        ),
+        "contact_conjugate": (solve, {"tolerance": 1e-3}),
+        "contact_fallback": ((f, errors, None, *solve[:2], *solve[3:7], None, pairs), h),
+        "contact_step_vjp": (
+            (f, f, actual, after, *state[:2], None, poses, history, pushes, back, material, plan, contact), h,
+        ),
+    }  # fmt: skip
+
+
+OF_CONTACT = ("contact_step", "contact_conjugate", "contact_fallback", "contact_step_vjp")  # on the CPU alone
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "rollout_vjp", "conjugate_gradients_",

@@ -18,6 +18,7 @@ from adjoint_scenes import (
     vertex_on_triangle,
 )
 from body_scenes import block, gravity, pose, simulator
+from op_samples import OF_CONTACT, samples
 from torch import Tensor
 
 import torchpd as pd
@@ -163,6 +164,13 @@ def test_what_has_no_gradient() -> None:
             torch.autograd.grad(after.positions.sum(), inputs["positions"], create_graph=True)[0].sum(),
             inputs["positions"],
         )
+
+
+@pytest.mark.parametrize("name", OF_CONTACT)
+def test_opcheck(name: str, dtype: torch.dtype) -> None:
+    arguments, keywords = samples(name, dtype, torch.device("cpu"))
+    report = torch.library.opcheck(getattr(torch.ops.torchpd, name).default, arguments, keywords)
+    assert set(report.values()) == {"SUCCESS"}
 
 
 def test_compiled() -> None:

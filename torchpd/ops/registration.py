@@ -315,7 +315,8 @@ def _refuse_mapped_contact(*_: Any, **__: Any) -> Any:
 
 def _save_contact(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
     positions, velocities, forces, poses, history, material, ctx.plan, contact = inputs
-    after, _, _, numbers, _, actual, keys, pair_forces, pushes = output
+    after, _, info, numbers, held_back, actual, keys, pair_forces, pushes = output
+    ctx.mark_non_differentiable(info, numbers, held_back, keys, pair_forces, pushes)  # reports
     ctx.time_step, ctx.counts = keyword_only_inputs["time_step"], (len(history), len(material), len(contact))
     ctx.set_materialize_grads(False)
     kept = (history[0], actual, keys, pair_forces)
@@ -323,12 +324,7 @@ def _save_contact(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[s
 
 
 def _contact_backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
-    grad_positions, grad_velocities, *_, grad_poses, _, of_forces, of_pushes = grads
-    if of_forces is not None or of_pushes is not None:
-        raise RuntimeError(
-            "torchpd::contact_step: forces of contact must not require gradients, got a loss that depends on them; "
-            "detach() them"
-        )
+    grad_positions, grad_velocities, *_, grad_poses, _, _, _ = grads
     positions, velocities, forces, poses, after, pushes, numbers, *others = ctx.saved_tensors
     history, others = others[:4], others[4:]
     count_history, count_material, count_contact = ctx.counts

@@ -109,8 +109,6 @@ class BodyContact:
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
             state[0], state[1], forces, wanted, history, material, plan, self.arrays, **settings
         )
-        # reports, whose loss the op refuses
-        rows, numbers, held, pushes = (report.detach() for report in (rows, numbers, held, pushes))
         flow = before.flow
         if flow.shape[-2]:
             (after,) = _ops.next_history(positions, material, plan, time_step=settings["time_step"])
