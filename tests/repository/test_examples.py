@@ -209,6 +209,14 @@ def test_push_to_goal(run) -> None:
     assert end < 0.95 * distances[0]
 
 
+def test_push_by_collider(run) -> None:
+    text = run("push_by_collider.py", "--steps", "10", "--tries", "4")
+    distances = [float(number) for number in re.findall(r"^ +\d+ +(\S+)$", text, flags=re.MULTILINE)]
+    assert len(distances) == 4
+    (end,) = numbers(text, r"end +(\S+)")
+    assert end < 0.9 * distances[0]
+
+
 def test_first_iterate(run) -> None:
     text = run("first_iterate.py", "--steps", "1", "--iterations", "4", "128")
     for few, many in zip(

@@ -17,6 +17,7 @@ steps of the sweeps, and q is any field on the vertices. So for a loss L
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,8 +44,8 @@ _SIDES = [(_CORNERS[0] - _CORNERS[a], [_CORNERS[a] - _CORNERS[b]]) for a, b in (
 _ENDS = [(_CORNERS[a] - _CORNERS[2], [_CORNERS[2] - _CORNERS[3]]) for a in (0, 1)] + [
     (_CORNERS[0] - _CORNERS[b], [_CORNERS[1] - _CORNERS[0]]) for b in (2, 3)
 ]
-_POINTS = [(_CORNERS[0] - _CORNERS[a], []) for a in (1, 2, 3)]
-_TIPS = [(_CORNERS[a] - _CORNERS[b], []) for a in (0, 1) for b in (2, 3)]
+_POINTS: list[tuple[Array, list[Array]]] = [(_CORNERS[0] - _CORNERS[a], []) for a in (1, 2, 3)]
+_TIPS: list[tuple[Array, list[Array]]] = [(_CORNERS[a] - _CORNERS[b], []) for a in (0, 1) for b in (2, 3)]
 _OF_POINTS, _OF_EDGES = [_FACE, *_SIDES, *_POINTS], [_INNER, *_ENDS, *_TIPS]
 
 
@@ -192,7 +193,8 @@ class _Pairs:
 def contact_adjoint(solved: SolvedContact, grad_positions: Tensor, grad_velocities: Tensor) -> ContactGradients:
     """Gradients of a loss by what a converged step depends on, from those by its end [V, 3]."""
     problem, h = solved.problem, solved.problem.time_step
-    count, jacobian = len(solved.after), torch.autograd.functional.jacobian
+    count = len(solved.after)
+    jacobian: Any = torch.autograd.functional.jacobian
     before = torch.tensor(problem.positions)
 
     def whole(bodies: Tensor, poses: Tensor) -> Tensor:
