@@ -146,7 +146,6 @@ class CoarseContact {
   }
 
  private:
-
   static Vec3<T> narrow(const Vec3<double>& a) { return {T(a.x), T(a.y), T(a.z)}; }
   static Vec3<double> wide(const Vec3<T>& a) { return widened<double>(a); }
   static double length(const Vec3<double>& a) { return square_root(dot(a, a)); }
@@ -293,7 +292,8 @@ class CoarseContact {
   std::vector<char> moves_;
   std::vector<ContactPair<T>> across_;
   std::vector<Kept<T>> kept_;
-  std::vector<char> several_;  // of bodies that touch themselves: whether they have several components
+  std::vector<char>
+      several_;  // of bodies that touch themselves: whether they have several components
   bool swept_ = false;
 };
 

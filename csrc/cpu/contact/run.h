@@ -33,10 +33,10 @@ class ContactRun {
   }
 
   const ContactPlan<T>& plan() const { return plan_; }
-  Places& place() { return place_; }              // of the present iterate
-  Places& target() { return target_; }            // of the next one, before contact
-  Places& goal() { return goal_; }                // of what moves by hand
-  std::vector<T>& inverse() { return inverse_; }  // 1 / D; 0 for what moves by hand
+  Places& place() { return place_; }                     // of the present iterate
+  Places& target() { return target_; }                   // of the next one, before contact
+  Places& goal() { return goal_; }                       // of what moves by hand
+  std::vector<T>& inverse() { return inverse_; }         // 1 / D; 0 for what moves by hand
   const Places& begin_places() const { return begin_; }  // at the step's start
   const PairList<T>& list() const { return list_; }
   bool moves_by_hand(int vertex) const { return held_[vertex] != 0; }
