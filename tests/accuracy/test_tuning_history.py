@@ -37,7 +37,7 @@ def test_the_bound_holds_in_another_motion_of_bodies_in_contact() -> None:
         touched += int(info.contact_gap < 1.1)
     assert touched >= 4
     # far fewer are not enough
-    sim.iterations = max(1, sim.iterations // 8)
+    sim.iterations = max(1, sim.iterations // 16)
     state = thrown(sim, -0.5, -1.5, 0.2)
     (exact,) = settled_steps(sim, state)
     assert exact.error_beyond_rounding(sim(state).velocities[0].double().numpy() / 60, sim.dtype) > 0.1

@@ -128,10 +128,11 @@ def test_a_cube_on_a_plate(dtype: torch.dtype) -> None:
     error = 1e-4 * weight
     center = (sim.masses[:, None] * after.positions[0]).sum(0) / sim.masses.sum()
     arm = center.double() - torch.tensor([0.2, 0.1, -0.3]).double()
+    length = float(arm.norm())
     down = torch.tensor([0.0, -weight, 0.0]).double()
     on_table = contacts.bodies[table]
     assert on_table.force[0].tolist() == pytest.approx(down.tolist(), abs=error)
-    assert on_table.torque[0].tolist() == pytest.approx(torch.linalg.cross(arm, down).tolist(), abs=error * 0.1)
+    assert on_table.torque[0].tolist() == pytest.approx(torch.linalg.cross(arm, down).tolist(), abs=error * length)
     assert on_table.about[0].tolist() == pytest.approx([0.2, 0.1, -0.3])
     assert torch.equal(contacts.on_colliders[:, 0], torch.cat([on_table.force, on_table.torque], dim=1))
     mutual = contacts.between[table, cube]
@@ -319,16 +320,21 @@ def test_gradients_by_finite_differences() -> None:
         contacts = sim.contact_forces(before, moved, targets=targets)
         return contacts.pairs.force, contacts.on_colliders, contacts.force
 
-    x = after.positions.clone().requires_grad_()
-    outputs = read_forces(x)
     generator = torch.Generator().manual_seed(0)
+    # off the ties of faces that lie on faces, whose closest points jump
+    x = after.positions + 1e-5 * torch.randn(after.positions.shape, generator=generator, dtype=torch.float64)
+    x.requires_grad_()
+    outputs = read_forces(x)
     weights = [torch.randn(out.shape, generator=generator, dtype=torch.float64) for out in outputs]
     (gradient,) = torch.autograd.grad(sum((w * out).sum() for w, out in zip(weights, outputs, strict=True)), x)
     way = torch.randn(x.shape, generator=generator, dtype=torch.float64)
     step = 1e-8
     with torch.no_grad():
         ends = [
-            sum(float((w * out).sum()) for w, out in zip(weights, read_forces(x + sign * step * way), strict=True))
+            sum(
+                float((w * out).sum())
+                for w, out in zip(weights, read_forces(x.detach() + sign * step * way), strict=True)
+            )
             for sign in (1.0, -1.0)
         ]
     assert (ends[0] - ends[1]) / (2 * step) == pytest.approx(float((gradient * way).sum()), rel=1e-4)

@@ -125,8 +125,9 @@ def tune(
     for solver in candidates or ():
         if not isinstance(solver, Solver):
             raise TypeError(f"tune: candidates must be solvers, such as Chebyshev() and Multilevel(), got {solver!r}")
-    start = named_state(sim.rest_state() if state is None else state)
+    start = sim.rest_state() if state is None else state
     check_start(sim, start, forces, targets)
+    start = named_state(start)
     study = _make_study(_with_targets(sim, targets, len(start[0])), start, forces, error)
     # steps that are no minimum may not settle; their uncertainty counts as error, so that the target is not attained
     if _is_minimum(sim):

@@ -12,11 +12,11 @@ from body_scenes import THICKNESS, H, block, cloth, gravity, plane, rotation, si
 from torch import Tensor
 
 import torchpd as pd
+from torchpd.ops.fake_kernels import CONTACT_FRICTION, CONTACT_THICKNESS
 from torchpd.reference import step_problem
 from torchpd.reference.contact.adjoint import ContactGradients, SolvedContact, contact_adjoint
 from torchpd.reference.contact.surfaces import Pairs
 
-FRICTION, THICK = 14, 15  # places of the arrays of contact, csrc/binding/contact_ops.h
 CONVERGED = 3000  # iterations
 
 
@@ -40,8 +40,8 @@ class Step:
             "forces": torch.zeros_like(self.state.positions),
             "start": start,
             "end": start.clone() if self.poses is None else self.poses.expand_as(start).clone(),
-            "contact_friction": contact.arrays[FRICTION],
-            "contact_thickness": contact.arrays[THICK],
+            "contact_friction": contact.arrays[CONTACT_FRICTION],
+            "contact_thickness": contact.arrays[CONTACT_THICKNESS],
             **{name: getattr(sim, name) for name in sim.material_names},
         }
         return {name: value.detach().clone() for name, value in given.items() if value.numel() > 0}
@@ -51,7 +51,7 @@ class Step:
         contact, sim = self.sim.body_contact, self.sim
         assert contact is not None
         arrays = list(contact.arrays)
-        arrays[FRICTION], arrays[THICK] = inputs["contact_friction"], inputs["contact_thickness"]
+        arrays[CONTACT_FRICTION], arrays[CONTACT_THICKNESS] = inputs["contact_friction"], inputs["contact_thickness"]
         history = self.state.history
         if "start" in inputs:
             history = history._replace(poses=inputs["start"])
