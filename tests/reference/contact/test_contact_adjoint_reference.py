@@ -9,6 +9,7 @@ from adjoint_scenes import CASES, seeded
 # m, m/s, N: where neither truncation of a difference of fourth order nor rounding counts
 STEPS = {
     "positions": 1e-7, "velocities": 1e-5, "forces": 1e-5, "start": 1e-7, "end": 1e-7, "contact_thickness": 1e-7,
+    "membrane_poisson": 1e-2,
 }  # fmt: skip
 
 
@@ -19,15 +20,15 @@ def test_differences(name: str) -> None:
 
     A gradient that is small beside its size has that of its size: a hundredth of it. Where more pairs slide, or are
     clamped, than there are directions, forces are not unique. Coarse corrections share their changes otherwise than the
-    sweeps that the adjoint knows: there to 1e-3.
+    sweeps that the adjoint knows: there to 5e-3.
     """
-    bound = 1e-3 if name in ("sliding cube", "clamp") else 1e-6
+    bound = 5e-3 if name in ("sliding cube", "clamp") else 1e-6
     step = CASES[name]()
     inputs, found = step.inputs(), step.reference_gradients()
     for number, (key, gradient) in enumerate(found.items()):
         direction = seeded(gradient, 10 + number)
         along = float((gradient * direction).sum())
-        wanted = step.difference(key, direction, STEPS.get(key, 3e-2 * float(inputs[key].abs().max())))
+        wanted = step.difference(key, direction, STEPS.get(key, 1e-2 * float(inputs[key].abs().max())))
         size = max(abs(wanted), 1e-2 * float(gradient.norm() * direction.norm()))
         assert abs(along - wanted) <= bound * size, key
     by_friction = step.reference().friction
