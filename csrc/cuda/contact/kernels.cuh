@@ -1,6 +1,6 @@
 // Kernels of cuda/contact/launch.h: a team of blocks takes one environment after another.
 #pragma once
-#include "cuda/common/arena.h"
+#include "views/arena.h"
 #include "cuda/common/inputs.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/teams.cuh"
@@ -183,7 +183,7 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
       const ContactHistory<T>& to = w.contact.history;
       steps.write(team, {to.next_poses + 7 * c, to.next_keys + m, to.next_forces + 4 * m,
                          w.contact.held_back + c, forces, w.contact.info + e * contact_info_count});
-      if (environment.numbers().most_pairs > plan.capacity) take_back(w, team, e);
+      if (steps.overflows()) take_back(w, team, e);
     }
     team.barrier();
   }

@@ -149,6 +149,9 @@ class ContactSteps {
   // whether all go as they want
   PD_HD bool is_at_rest() const { return !env_.numbers().cut && !env_.numbers().waits; }
 
+  // whether pairs exceed the capacity
+  PD_HD bool overflows() const { return env_.numbers().most_pairs > plan_.capacity; }
+
   // At the end of a step: forces on every vertex [vertices, 3] N.
   template <class Team>
   PD_HD void finish(const Team& team, T* forces) const {
@@ -187,7 +190,7 @@ class ContactSteps {
   template <class Team>
   PD_HD void write(const Team& team, const Output& to) const {
     const ContactNumbers& numbers = env_.numbers();
-    const bool overflows = numbers.most_pairs > plan_.capacity;
+    const bool overflows = this->overflows();
     const int pairs = overflows ? 0 : numbers.pairs;
     team.each(pairs, [&](int p) { a_.entry[p] = a_.pair[p].has_force(); });
     team.scan(a_.entry, pairs);
