@@ -83,9 +83,11 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     Base::align();
     begun_ ? steps_.go_last(alone_, set_.iterations) : steps_.go_first(alone_);
     begun_ = true;
+    correct();
   }
 
   void iterate(int k) {
+    if (has_correction(k, set_.iterations)) correct();
     const T omega(next_omega_[0]);
     const bool guards = schedule_[0].checks_energy(k);
     const auto gradient = elastic_gradient<true>(guards);
@@ -120,6 +122,19 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   }
 
  private:
+  // The coarse correction of bodies in contact.
+  void correct() {
+    bool cuts = true;
+    for (int n = 0; cuts && n < coarse_trials && steps_.begin_correction(alone_); ++n) {
+      if constexpr (HasContacts) {
+        this->each_elastic_force([&](std::int64_t i, const Vec3<double>& force) {
+          this->keep_forces(i, force, 1.0);
+        });
+      }
+      cuts = steps_.correct(alone_, [&](int i) { return this->forces_of(i); });
+    }
+  }
+
   static T* numbers(Value* values) { return reinterpret_cast<T*>(values); }
 
   BodyState<T> body() {
@@ -128,9 +143,9 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
             numbers(w_.x),
             numbers(w_.u),
             numbers(w_.before),
-            numbers(w_.before),
             numbers(w_.target),
             reinterpret_cast<T*>(memory_.saved()),
+            numbers(w_.before),
             w_.inverse,
             w_.inertia,
             call_.material.masses.of(e_),

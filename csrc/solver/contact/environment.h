@@ -7,13 +7,15 @@
 //   once(task)             one thread, and a barrier
 //   sum(count, add, sums)  sums of doubles in a fixed order, the same in all threads; scan(numbers, count): prefix sums
 //   walk(count, start, visit)  walks start(item) through a tree, and visit(owner, other) for what they find
-//   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own
+//   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own, and
+//                          select: items in their order
 //
 // All threads of a team take the same branches: what they decide by is not written in the phase that follows.
 #pragma once
 #include "contact/box.h"
 #include "contact/pairs/shares.h"
 #include "solver/chebyshev.h"
+#include "solver/coarse/island.h"
 #include "solver/contact/shared_numbers.h"
 #include "solver/step.h"
 #include "solver/vertex.h"
@@ -31,6 +33,7 @@ struct ContactNumbers {
   int waits, checked;
   // of an iteration
   int active, outside, loaded, cut, stopped, meets, changed, near;
+  int corrects, searching, leaves, cuts, pushes;  // of a coarse correction
   int stuck;  // whether a pair of the list may be frozen
 };
 
@@ -79,7 +82,19 @@ struct ContactArrays {
   Screw<T>* screw;                      // [colliders]
   T *share, *least, *bound;             // [colliders]
   int* barred;                          // [colliders]
-  unsigned char* touches;               // [components]
+  // of the coarse correction
+  int *inside, *component;  // [vertices] of bodies: internal number; component that moves rigidly, or -1
+  CoarseBody* coarse_body;                              // [components]
+  CoarseIsland* island;                                 // [components] by its least member
+  RigidMotion<double>* motion;                          // [components]
+  double *coarse_sum, *newton, *matrix;                 // [components, 31], [components, 18], [components^2, 36]
+  double *coarse_share, *coarse_joint, *coarse_limit;   // [components]
+  int *root, *size, *first, *local, *member;            // [components] of islands
+  int *component_begin, *component_end, *coarse_group;  // [components]
+  int *side_start, *side_pair;  // [components + 1], [2 capacity] pairs of each component
+  unsigned char *valid, *touches, *couple, *joins;  // [components], [components^2], [capacity]
+  PairTerms* terms;                                 // [capacity]
+  double* radius;                                   // [capacity] of friction
   T* most;                              // [colliders + 2]: held back, pins held back, least d / r
   ContactNumbers* numbers;
 };
@@ -129,7 +144,26 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   arena.place(a.screw, c);
   for (T** array : {&a.share, &a.least, &a.bound}) arena.place(*array, c);
   arena.place(a.barred, c);
-  arena.place(a.touches, components);
+  const std::int64_t g = components;
+  for (int** array : {&a.inside, &a.component}) arena.place(*array, v);
+  arena.place(a.coarse_body, g);
+  arena.place(a.island, g);
+  arena.place(a.motion, g);
+  arena.place(a.coarse_sum, ContactSums::count * g);
+  arena.place(a.newton, 18 * g);
+  arena.place(a.matrix, 36 * g * g);
+  for (double** array : {&a.coarse_share, &a.coarse_joint, &a.coarse_limit})
+    arena.place(*array, g);
+  for (int** array : {&a.root, &a.size, &a.first, &a.local, &a.member, &a.component_begin,
+                      &a.component_end, &a.coarse_group})
+    arena.place(*array, g);
+  arena.place(a.side_start, g + 1);
+  arena.place(a.side_pair, g > 0 ? 2 * m : 0);
+  for (unsigned char** array : {&a.valid, &a.touches}) arena.place(*array, g);
+  arena.place(a.couple, g * g);
+  arena.place(a.joins, g > 0 ? m : 0);
+  arena.place(a.terms, g > 0 ? m : 0);
+  arena.place(a.radius, g > 0 ? m : 0);
   arena.place(a.most, c + 2);
   arena.place(a.numbers, 1);
 }
@@ -142,7 +176,8 @@ struct BodyState {
   const int *order, *component;    // user's number; component that moves rigidly, or -1
   const T* x;                      // at the start of the step
   T *u, *before;                   // displacement of the iterate, and of the one before
-  const T *free, *target, *saved;  // of the free iterate; s; before a coarse correction
+  T *target, *saved;               // s; of a vertex before a coarse correction
+  const T* free;                   // of the free iterate
   const T *inverse, *inertia;      // every `stride` numbers
   const T* mass;                   // by the user's number
   int stride, vertices, components;
@@ -159,8 +194,9 @@ struct BodyState {
     return read(x, i) + displacement;
   }
   PD_HD T inverse_of(int i) const { return inverse[std::int64_t(i) * stride]; }
+  PD_HD T inertia_of(int i) const { return inertia[std::int64_t(i) * stride]; }
   PD_HD Vertex<Thread<T>, true> vertex(int i) const {
-    return {read(x, i), read(target, i), inertia[std::int64_t(i) * stride], inverse_of(i)};
+    return {read(x, i), read(target, i), inertia_of(i), inverse_of(i)};
   }
 };
 
@@ -207,6 +243,22 @@ struct ContactEnvironment {
       if (counts) push = {force.x, force.y, force.z, pair.near.weight[corner]};
       a.push[a.slot[4 * p + corner]] = push;
     }
+  }
+  // The force of all pairs on a vertex, after keep_pushes.
+  PD_HD Vec3<T> force_on(int v) const {
+    Vec3<T> force = {T(0), T(0), T(0)};
+    for (int n = a.start[v]; n < a.start[v + 1]; ++n) {
+      const Four<T> push = a.push[n];
+      force = multiply_add(push.w, Vec3<T>{push.x, push.y, push.z}, force);
+    }
+    return force;
+  }
+  // Closest points and normal at the present iterate.
+  PD_HD void look(ContactPair<T>& pair) const {
+    Vec3<T> corner[4];
+    pair.corners(a.place, corner);
+    pair.near = closest_points(pair.edges, corner);
+    pair.normal = pair.normal_at(pair.near);
   }
   // calls visit(normal, bound) for the planes and spheres of the scene
   template <class Visit>

@@ -60,6 +60,12 @@ class SerialTeam {
   void least_range(int begin, int end, const Take& take, double (&least)[Count]) const {
     for (int i = begin; i < end; ++i) take(i, least);
   }
+  // Writes the items of [0, count) that `is` picks to `out`, in their order.
+  template <class Is>
+  void select(int count, const Is& is, int* out) const {
+    for (int i = 0; i < count; ++i)
+      if (is(i)) *out++ = i;
+  }
   bool leads() const { return true; }
 };
 

@@ -3,7 +3,7 @@
 //   start; [coarse correction] go_first; for k: [free iterate, energy] iterate(k);
 //   [coarse correction] go_last; finish; write
 #pragma once
-#include "solver/contact/approach.h"
+#include "solver/contact/coarse.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -13,7 +13,7 @@ class ContactSteps {
   using Env = ContactEnvironment<T>;
 
   PD_HD explicit ContactSteps(const Env& env)
-      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env) {}
+      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env), correction_(env, search_) {}
 
   // A step begins at the places of bodies; poses are those of colliders, actual ones and those of the step's end.
   template <class Team>
@@ -21,6 +21,7 @@ class ContactSteps {
     team.spread(plan_.vertices, [&](int v) { a_.surface[v] = 0; });
     team.spread(body_.vertices, [&](int i) {
       const int v = body_.order[i];
+      a_.inside[v] = i, a_.component[v] = body_.component[i];
       a_.place[v] = a_.begin[v] = body_.place(i, {T(0), T(0), T(0)});
       a_.inverse[v] = body_.inverse_of(i);
       a_.held[v] = !(body_.inverse_of(i) > T(0));
@@ -107,6 +108,44 @@ class ContactSteps {
     go(team, false, none);
   }
 
+  // The coarse correction of bodies in contact. In between, where planes and spheres exist, the runner keeps their forces
+  // at the gradient by the targets of now. Returns whether there is something to correct.
+  template <class Team>
+  PD_HD bool begin_correction(const Team& team) const {
+    if (body_.components == 0) return false;
+    correction_.begin(team);
+    if (!env_.numbers().corrects) return false;
+    if (env_.walls.exist()) correction_.shift_targets(team);
+    return true;
+  }
+
+  // `forces(i)`: those that the runner has kept. Returns whether a motion was cut.
+  template <class Team, class Forces>
+  PD_HD bool correct(const Team& team, const Forces& forces) const {
+    ContactNumbers& numbers = env_.numbers();
+    if (env_.walls.exist()) correction_.restore_targets(team);
+    correction_.move(team, forces);
+    const bool cuts = numbers.cuts != 0, pushes = numbers.pushes != 0;
+    team.spread(1, [&](int) { numbers.checked = numbers.cut = 0; });
+    team.each(body_.vertices, [&](int i) {
+      leave_walls(i);
+      a_.cut[body_.order[i]] = 0;
+    });
+    if (numbers.leaves) search_.find(team, false);
+    const int pairs = numbers.pairs;
+    team.each(pairs, [&](int p) {
+      env_.look(a_.pair[p]);
+      renew(p, a_.place);
+      if (pushes) renew(p, a_.target);
+    });
+    if (pushes) {
+      double none[2];
+      go(team, false, none);
+    }
+    correction_.end(team);
+    return cuts;
+  }
+
   // An iteration of a step, from the free iterate without contact. `energy`: E at the iterate, if
   // the schedule checks it. `sums`: squares of the change, and of the displacement from the target,
   // with a tolerance.
@@ -135,7 +174,7 @@ class ContactSteps {
         watch_vertex(plan_.body_vertices + n);
       });
     } else {
-      team.spread(pairs, [&](int p) { look(a_.pair[p]); });
+      team.spread(pairs, [&](int p) { env_.look(a_.pair[p]); });
       want(team, body_.free);
       if (of.guards) merits = check(team, pairs, of.energy);
       if (pairs > 0) prox(team, pairs, of.c);
@@ -160,16 +199,12 @@ class ContactSteps {
               [&](int n) { a_.most[n] = n < plan_.colliders + 1 ? T(0) : T(HUGE_VAL); });
     team.each(pairs, [&](int p) {
       ContactPair<T>& pair = a_.pair[p];
-      look(pair);
+      env_.look(pair);
       lower(a_.most + plan_.colliders + 1, pair.near.distance / pair.thickness);
       env_.keep_pushes(p, true);
     });
     team.each(plan_.vertices, [&](int v) {
-      Vec3<T> force = {T(0), T(0), T(0)};
-      for (int n = a_.start[v]; n < a_.start[v + 1]; ++n) {
-        const Four<T> push = a_.push[n];
-        force = multiply_add(push.w, Vec3<T>{push.x, push.y, push.z}, force);
-      }
+      const Vec3<T> force = env_.force_on(v);
       T* const to = forces + 3 * std::int64_t(v);
       to[0] = force.x, to[1] = force.y, to[2] = force.z;
       if (!env_.held(v)) return;
@@ -240,10 +275,8 @@ class ContactSteps {
   PD_HD void restore_touching(const Team& team, const Each& each_touching) const {
     if (body_.components == 0) return;
     team.each(body_.components, [&](int g) { a_.touches[g] = 0; });
-    // components by the user's numbers
-    team.each(body_.vertices, [&](int i) { a_.cursor[body_.order[i]] = body_.component[i]; });
     each_touching([&](int v) {
-      const int g = v < plan_.body_vertices ? a_.cursor[v] : -1;
+      const int g = v < plan_.body_vertices ? a_.component[v] : -1;
       if (g >= 0) a_.touches[g] = 1;
     });
     team.each(body_.vertices, [&](int i) {
@@ -274,14 +307,6 @@ class ContactSteps {
     Vec3<T>& target = a_.target[body_.order[i]];
     const Vec3<T> u = target - BodyState<T>::read(body_.x, i);
     target = body_.place(i, body_.vertex(i).project(env_.walls, u, BodyState<T>::read(body_.u, i)));
-  }
-
-  // Closest points and normal at the present iterate.
-  PD_HD void look(ContactPair<T>& pair) const {
-    Vec3<T> corner[4];
-    pair.corners(a_.place, corner);
-    pair.near = closest_points(pair.edges, corner);
-    pair.normal = pair.normal_at(pair.near);
   }
 
   // E + psi at the last check and now, both by the list and the multipliers of now.
@@ -412,12 +437,15 @@ class ContactSteps {
       return;
     }
     team.spread(1, [&](int) { numbers.waits = outside; });
-    team.each(pairs, [&](int p) {
-      ContactPair<T>& pair = a_.pair[p];
-      if (!breaks(pair, a_.target)) return;
-      make_plane(pair, a_.place, a_.target, pair.near, pair.plane.normal);
-      env_.keep_spaces(p);
-    });
+    team.each(pairs, [&](int p) { renew(p, a_.target); });
+  }
+
+  // Makes the plane of a pair anew at the present iterate if places do not let it be.
+  PD_HD void renew(int p, const Vec3<T>* to) const {
+    ContactPair<T>& pair = a_.pair[p];
+    if (!breaks(pair, to)) return;
+    make_plane<T, const Vec3<T>*>(pair, a_.place, to, pair.near, pair.plane.normal);
+    env_.keep_spaces(p);
   }
 
   PD_HD void cut(int v) const {
@@ -538,6 +566,7 @@ class ContactSteps {
   const ContactArrays<T>& a_;
   const BodyState<T>& body_;
   const ContactSearch<T> search_;
+  const ContactCorrection<T> correction_;
 };
 
 }  // namespace pd::inline PD_TARGET
