@@ -6,7 +6,7 @@ namespace pd::inline PD_TARGET {
 
 constexpr int contact_threads = 128;
 constexpr int contact_chunk = 1024;  // items of a sum that one block adds up
-constexpr int most_contact_sums = 12;
+constexpr int most_contact_sums = 36;
 
 // Sums do not depend on the number of blocks: every chunk is added up by one, and all add up the chunks alike.
 class ContactTeam {
@@ -147,6 +147,20 @@ class ContactTeam {
 #pragma unroll 1
     for (int i = begin + int(threadIdx.x); i < end; i += contact_threads) take(i, least);
     block_reduce(least, Min{});
+  }
+  template <class Is>
+  PD_DEVICE void select(int count, const Is& is, int* out) const {
+    int before = 0;
+#pragma unroll 1
+    for (int begin = 0; begin < count; begin += contact_threads) {
+      const int i = begin + int(threadIdx.x);
+      const bool own = i < count && is(i);
+      int total;
+      const int at = before + block_scan(own, total);
+      if (own) out[at] = i;
+      before += total;
+    }
+    __syncthreads();
   }
   PD_DEVICE bool leads() const { return threadIdx.x == 0; }
 
