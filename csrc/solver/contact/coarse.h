@@ -397,17 +397,29 @@ class ContactCorrection {
       const Vec3<double> chord = motion.turn * (wide(a_.place[v]) - motion.center);
       return T(turn_bow * square_root(dot(chord, chord))) + own;
     };
-    if (leaves) search_.refit(team, swept, reach);
+    bool meets = false;
+    if (leaves) {
+      team.each(plan_.bodies, [&](int b) { a_.itself[b] = 0; });
+      team.each(plan_.body_vertices, [&](int v) {
+        const int b = plan_.body[v];
+        if (plan_.touches_itself[b] && a_.component[v] != a_.component[plan_.body_start[b]])
+          a_.itself[b] = 1;
+      });
+      meets = search_.fit(team, swept, reach, true);
+    }
     for (int round = 0; round < share_rounds; ++round) {
       set_limits(team);
       const auto bound = [&](const ContactPair<T>& pair) {
         lower_share(pair, round + 1 == share_rounds);
       };
-      if (leaves) {
-        search_.each_boxed(
-            team, swept, reach, [](int) { return true; },
-            [&](int, int, const ContactPair<T>& pair) { bound(pair); });
-      } else {
+      if (meets) {
+        search_.each_boxed(team, [&](const auto& found) {
+          found.each([&](int owner, int other) {
+            ContactPair<T> pair;
+            if (search_.find_pair(owner, other, pair)) bound(pair);
+          });
+        });
+      } else if (!leaves) {
         team.each(pairs, [&](int p) { bound(a_.pair[p]); });
       }
       const bool changed = numbers.changed != 0;

@@ -6,16 +6,18 @@
 //   spread(count, item)    a phase; each(count, item): and a barrier, after which all see what it wrote
 //   once(task)             one thread, and a barrier
 //   sum(count, add, sums)  sums of doubles in a fixed order, the same in all threads; scan(numbers, count): prefix sums
-//   walk(count, start, visit)  walks start(item) through a tree, and visit(owner, other) for what they find
+//   walk(boxes, sides, visit)  pairs of sides whose boxes meet; see solver/contact/search.h
+//   warps(count, visit)    visit(n, lanes) for every n by 32 lanes of solver/contact/clusters.h
+//   each_closest(count, pair_at, places, visit)  visit(n, closest points) of pairs, and a barrier
 //   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own, and
 //                          select: items in their order
 //
 // All threads of a team take the same branches: what they decide by is not written in the phase that follows.
 #pragma once
-#include "contact/box.h"
 #include "contact/pairs/shares.h"
 #include "solver/chebyshev.h"
 #include "solver/coarse/island.h"
+#include "solver/contact/clusters.h"
 #include "solver/contact/shared_numbers.h"
 #include "solver/step.h"
 #include "solver/vertex.h"
@@ -32,7 +34,8 @@ struct ContactNumbers {
   int searched_at;
   int waits, checked;
   // of an iteration
-  int active, outside, loaded, cut, stopped, meets, changed, near;
+  int active, outside, loaded, cut, stopped, meets, changed;
+  int listed;  // near pairs that were found, listed or not
   int corrects, searching, leaves, cuts, pushes;  // of a coarse correction
   int stuck;  // whether a pair of the list may be frozen
 };
@@ -41,6 +44,11 @@ struct ContactNumbers {
 template <class T>
 struct alignas(4 * sizeof(T) > 16 ? 16 : 4 * sizeof(T)) Four {
   T x, y, z, w;
+};
+
+// Two sides: a row of `point` or, above these, an edge; and a triangle, or a later edge.
+struct SidePair {
+  int owner, other;
 };
 
 // What a pair keeps over the sweeps of an iteration.
@@ -71,12 +79,10 @@ struct ContactArrays {
   int *owner, *partner;                 // [capacity] parts of a pair
   int* owner_start;                     // [owners + 1] pairs of each vertex, then of each edge
   int* owner_near;                      // [owners]
-  Box<T>*triangle_box, *edge_box;       // of trees, all levels
   RigidWay* rigid;                      // [bodies]
   Box<T>* body_box;                     // [bodies]
   T *together, *alone, *joint, *limit;  // [bodies] shares of ways
-  int *body_begin, *body_end;           // [bodies] vertices
-  int* group;                           // [bodies]
+  int* joined;                          // [bodies] links to lesser bodies of a group
   unsigned char *own, *pinned, *moves;  // [bodies]
   Hand<T>* hand;                        // [colliders]
   Screw<T>* screw;                      // [colliders]
@@ -96,18 +102,26 @@ struct ContactArrays {
   PairTerms* terms;                                 // [capacity]
   double* radius;                                   // [capacity] of friction
   T* most;                              // [colliders + 2]: held back, pins held back, least d / r
+  // of the search
+  Cluster<T>*cluster, *group;  // [clusters] boxes of sides; [groups] of trees over clusters
+  SidePair* near_side;         // [near pairs] in any order
+  T* near_value;               // [near pairs]
+  T* ball_most;                // [bodies] largest radius of balls
+  // [bodies] asked: with itself, with any; moves by hand
+  unsigned char *itself, *wanted, *by_hand;
   ContactNumbers* numbers;
 };
 
-// Numbers of nodes of a tree over `count` leaves with 32 children a node.
-constexpr int tree_fan = 32;
-PD_HD std::int64_t count_nodes(int count) {
-  std::int64_t all = count;
-  for (int n = count; n > 1;) {
-    n = (n + tree_fan - 1) / tree_fan;
-    all += n;
-  }
-  return all;
+template <class T>
+PD_HD int count_all_groups(const ContactPlan<T>& plan) {
+  return count_groups(plan.point_clusters) + count_groups(plan.edge_clusters) +
+         count_groups(plan.clusters - plan.point_clusters - plan.edge_clusters);
+}
+
+// Room of the list of near pairs: balls reach a part of them.
+template <class T>
+PD_HD int count_near(const ContactPlan<T>& plan) {
+  return 2 * plan.capacity;
 }
 
 // `arena`: place(array, count)
@@ -133,12 +147,10 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   for (int** array : {&a.owner, &a.partner}) arena.place(*array, m);
   arena.place(a.owner_start, owners + 1);
   arena.place(a.owner_near, owners);
-  arena.place(a.triangle_box, count_nodes(plan.triangles));
-  arena.place(a.edge_box, count_nodes(plan.edges));
   arena.place(a.rigid, b);
   arena.place(a.body_box, b);
   for (T** array : {&a.together, &a.alone, &a.joint, &a.limit}) arena.place(*array, b);
-  for (int** array : {&a.body_begin, &a.body_end, &a.group}) arena.place(*array, b);
+  arena.place(a.joined, b);
   for (unsigned char** array : {&a.own, &a.pinned, &a.moves}) arena.place(*array, b);
   arena.place(a.hand, c);
   arena.place(a.screw, c);
@@ -165,6 +177,12 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   arena.place(a.terms, g > 0 ? m : 0);
   arena.place(a.radius, g > 0 ? m : 0);
   arena.place(a.most, c + 2);
+  arena.place(a.cluster, plan.clusters);
+  arena.place(a.group, count_all_groups(plan));
+  arena.place(a.near_side, count_near(plan));
+  arena.place(a.near_value, count_near(plan));
+  arena.place(a.ball_most, b);
+  for (unsigned char** array : {&a.itself, &a.wanted, &a.by_hand}) arena.place(*array, b);
   arena.place(a.numbers, 1);
 }
 

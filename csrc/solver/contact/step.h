@@ -56,6 +56,7 @@ class ContactSteps {
       numbers.known = begin;
       env_.numbers() = numbers;
     });
+    search_.begin(team);
   }
 
   // Approach, search and the first iterate, as near to the corrected guess as the promise allows.
