@@ -31,8 +31,30 @@ struct WarpLanes {
 };
 
 // Sums do not depend on the number of blocks: every chunk is added up by one, and all add up the chunks alike.
+// A thread's item.
+template <class T>
+struct SingleLane {
+  using Number = T;
+  int item;
+
+  PD_DEVICE T load(const T* row) const { return row[item]; }
+  PD_DEVICE void store(T* row, T value) const { row[item] = value; }
+  template <class Get>
+  PD_DEVICE Vec3<T> vector(const Get& get) const {
+    const auto of = get(item);
+    return {of.x, of.y, of.z};
+  }
+  template <class Visit>
+  PD_DEVICE void each(const Visit& visit) const {
+    visit(item);
+  }
+  PD_DEVICE static bool all(bool holds) { return holds; }
+};
+
 class ContactTeam {
  public:
+  static constexpr bool in_order = false;
+
   // `partial`: [chunks, 2], `counts`: [chunks]
   PD_DEVICE ContactTeam(BlockTeam& team, double* partial, int* counts)
       : team_(team), partial_(partial), counts_(counts) {}
@@ -51,6 +73,10 @@ class ContactTeam {
   PD_DEVICE void warps(int count, const Visit& visit) const {
 #pragma unroll 1
     for (int n = team_.warp(); n < count; n += team_.warps()) visit(n, WarpLanes());
+  }
+  template <class T, class Visit>
+  PD_DEVICE void blocks(int count, const Visit& visit) const {
+    each(count, [&](int n) { visit(SingleLane<T>{n}); });
   }
   template <class T, class PairAt, class Visit>
   PD_DEVICE void each_closest(int count, const PairAt& pair_at, const Vec3<T>* places,

@@ -42,7 +42,6 @@ class ContactCorrection {
       a_.component_begin[g] = plan_.body_vertices, a_.component_end[g] = 0;
     });
     team.spread(pairs, [&](int p) {
-      env_.look(a_.pair[p]);
       a_.joins[p] = joins(a_.pair[p]);
       if (!a_.joins[p]) return;
       numbers.corrects = 1;

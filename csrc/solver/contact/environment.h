@@ -3,12 +3,14 @@
 // A phase calls a function for every item: vertex, pair, part of a surface, body. Items of a phase
 // do not depend on each other, so any number of threads has the same bits. A team offers
 //
+//   in_order               whether one thread takes all items in their order
 //   spread(count, item)    a phase; each(count, item): and a barrier, after which all see what it wrote
 //   once(task)             one thread, and a barrier
 //   sum(count, add, sums)  sums of doubles in a fixed order, the same in all threads; scan(numbers, count): prefix sums
 //   walk(boxes, sides, visit)  pairs of sides whose boxes meet; see solver/contact/search.h
 //   warps(count, visit)    visit(n, lanes) for every n by 32 lanes of solver/contact/clusters.h
 //   each_closest(count, pair_at, places, visit)  visit(n, closest points) of pairs, and a barrier
+//   blocks<T>(count, visit)  visit(lanes) for blocks of items in vector instructions, and a barrier
 //   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own, and
 //                          select: items in their order
 //
@@ -21,6 +23,9 @@
 #include "solver/contact/shared_numbers.h"
 #include "solver/step.h"
 #include "solver/vertex.h"
+#if !defined(__CUDACC__)
+#include "math/pack.h"
+#endif
 
 #include <cstddef>
 #include <cstdint>
@@ -37,7 +42,7 @@ struct ContactNumbers {
   int active, outside, loaded, cut, stopped, meets, changed;
   int listed;  // near pairs that were found, listed or not
   int corrects, searching, leaves, cuts, pushes;  // of a coarse correction
-  int stuck;  // whether a pair of the list may be frozen
+  int moved, changes[contact_sweeps];  // vertices of active pairs; whether sweeps change a force
 };
 
 // Four numbers, for loads of 16 bytes.
@@ -51,12 +56,51 @@ struct SidePair {
   int owner, other;
 };
 
-// What a pair keeps over the sweeps of an iteration.
+#if defined(__CUDACC__)
 template <class T>
-struct PairSweep {
-  T beta;
-  Vec3<T> before;  // sum w x_t
+PD_HD Four<T> multiply_add(T s, const Four<T>& a, const Four<T>& b) {
+  return {multiply_add(s, a.x, b.x), multiply_add(s, a.y, b.y), multiply_add(s, a.z, b.z), T(0)};
+}
+#else
+template <class T>
+PD_HD Four<T> multiply_add(T s, const Four<T>& a, const Four<T>& b) {
+  using P = Pack<T, 4>;
+  Four<T> sum;
+  multiply_add(P(s), P::load(&a.x), P::load(&b.x)).store(&sum.x);
+  return sum;
+}
+#endif
+
+// What active pairs keep over the sweeps of an iteration, row by row.
+template <class T>
+struct ActiveRows {
+  static constexpr int weight = 0, moves = 4,  // of the corners; theta omega w / D
+      between = 8, before = 11, normal = 14,   // sums w x of targets, and at the step's start
+      tangential = 17, normal_force = 20, force = 21, beta = 24, thickness = 25, friction = 26,
+                       count = 27;
+  static constexpr int padding = 16;  // lanes past the last pair
+
+  T* numbers;     // [count, stride]
+  int* integers;  // [5, stride]: pair, vertices
+  std::int64_t stride;
+
+  PD_HD ActiveRows(T* memory, int capacity)
+      : numbers(memory),
+        integers(reinterpret_cast<int*>(memory + count * (std::int64_t(capacity) + padding))),
+        stride(std::int64_t(capacity) + padding) {}
+
+  PD_HD static std::int64_t size(int capacity) {
+    return (count + 5) * (std::int64_t(capacity) + padding);
+  }
+  PD_HD T* row(int n) const { return numbers + n * stride; }
+  PD_HD T& at(int n, int q) const { return row(n)[q]; }
+  PD_HD int& pair(int q) const { return integers[q]; }
+  PD_HD int& vertex(int corner, int q) const { return integers[(1 + corner) * stride + q]; }
 };
+
+// Whether planes that are new since the last move may cut the way of a vertex, or whether it must stay: targets have been
+// compared with all others.
+enum Limits : int { limits_none, limits_planes, limits_stuck };
 
 // Arrays of an environment. Vertices have the user's numbers, those of colliders last.
 template <class T>
@@ -64,14 +108,16 @@ struct ContactArrays {
   Vec3<T>*begin, *place, *target, *goal, *shift, *checked, *end;  // [vertices] m
   Ball<T>* ball;                                                  // [vertices]
   T *inverse, *weight, *room;                                     // [vertices]
-  unsigned char *held, *cut, *surface, *touched;                  // [vertices]
+  unsigned char *held, *cut, *surface;                            // [vertices]
+  int *limits, *touched, *moved;  // [vertices] Limits; of an active pair; those in any order
+  Four<T>* moved_by;              // [vertices] by active pairs, m
   // Entries of vertices: corners of their pairs, in the order of the pairs.
   int *start, *cursor;  // [vertices + 1] first entry of each; counts
   int *entry, *slot;    // [4 capacity] pair * 4 + corner in any order; the entry of each corner
   Four<T>*push,
       *space;  // [4 capacity] by entry: force of the pair and weight; normal and bound of a half-space
-  T* margin;                            // [4 capacity] of the half-space, or -1: its pair is frozen
-  PairSweep<T>* sweep;                  // [capacity]
+  T* margin;                            // [4 capacity] of the half-space
+  T* rows;                              // ActiveRows
   ContactPair<T>* pair;                 // [capacity] in the order of their keys
   unsigned char* active;                // [capacity]
   std::int64_t* known_key;              // [capacity] of the list before
@@ -100,7 +146,7 @@ struct ContactArrays {
   int *side_start, *side_pair;  // [components + 1], [2 capacity] pairs of each component
   unsigned char *valid, *touches, *couple, *joins;  // [components], [components^2], [capacity]
   PairTerms* terms;                                 // [capacity]
-  double* radius;                                   // [capacity] of friction
+  double* radius;                                   // [capacity] of friction; of a check, psi
   T* most;                              // [colliders + 2]: held back, pins held back, least d / r
   // of the search
   Cluster<T>*cluster, *group;  // [clusters] boxes of sides; [groups] of trees over clusters
@@ -133,13 +179,15 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
     arena.place(*array, v);
   arena.place(a.ball, v);
   for (T** array : {&a.inverse, &a.weight, &a.room}) arena.place(*array, v);
-  for (unsigned char** array : {&a.held, &a.cut, &a.surface, &a.touched}) arena.place(*array, v);
+  for (unsigned char** array : {&a.held, &a.cut, &a.surface}) arena.place(*array, v);
+  for (int** array : {&a.limits, &a.touched, &a.moved}) arena.place(*array, v);
+  arena.place(a.moved_by, v);
   for (int** array : {&a.start, &a.cursor}) arena.place(*array, v + 1);
   arena.place(a.entry, 4 * m + 1);
   arena.place(a.slot, 4 * m);
   for (Four<T>** array : {&a.push, &a.space}) arena.place(*array, 4 * m);
   arena.place(a.margin, 4 * m);
-  arena.place(a.sweep, m);
+  arena.place(a.rows, ActiveRows<T>::size(plan.capacity));
   arena.place(a.pair, m);
   arena.place(a.active, m);
   arena.place(a.known_key, m);
@@ -175,7 +223,7 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   arena.place(a.couple, g * g);
   arena.place(a.joins, g > 0 ? m : 0);
   arena.place(a.terms, g > 0 ? m : 0);
-  arena.place(a.radius, g > 0 ? m : 0);
+  arena.place(a.radius, m);
   arena.place(a.most, c + 2);
   arena.place(a.cluster, plan.clusters);
   arena.place(a.group, count_all_groups(plan));
@@ -233,23 +281,17 @@ struct ContactEnvironment {
   PD_HD int owners() const { return plan.points + plan.edges; }
   PD_HD ContactNumbers& numbers() const { return *a.numbers; }
 
-  PD_HD bool is_stuck(int v) const {
-    bool stuck = false;
-    if (numbers().stuck) {
-      for (int n = a.start[v]; n < a.start[v + 1]; ++n) stuck = stuck || a.margin[n] < T(0);
-    }
-    return stuck;
-  }
+  PD_HD bool is_stuck(int v) const { return a.limits[v] == limits_stuck; }
   // The half-spaces of the corners of a pair.
   PD_HD void keep_spaces(int p) const {
     const ContactPair<T>& pair = a.pair[p];
-    if (pair.plane.frozen) numbers().stuck = 1;
     for (int corner = 0; corner < 4; ++corner) {
       const int n = a.slot[4 * p + corner];
       visit_space(pair.plane, pair.on_a(corner), [&](const Vec3<T>& normal, T bound, T margin) {
         a.space[n] = {normal.x, normal.y, normal.z, bound};
-        a.margin[n] = pair.plane.frozen ? T(-1) : margin;
+        a.margin[n] = margin;
       });
+      raise(a.limits + pair.vertex[corner], int(pair.plane.frozen ? limits_stuck : limits_planes));
     }
   }
   // The force of a pair, by entries; zeros where it does not count.
@@ -271,13 +313,6 @@ struct ContactEnvironment {
     }
     return force;
   }
-  // Closest points and normal at the present iterate.
-  PD_HD void look(ContactPair<T>& pair) const {
-    Vec3<T> corner[4];
-    pair.corners(a.place, corner);
-    pair.near = closest_points(pair.edges, corner);
-    pair.normal = pair.normal_at(pair.near);
-  }
   // calls visit(normal, bound) for the planes and spheres of the scene
   template <class Visit>
   PD_HD void each_wall(int v, const Vec3<T>& place, const Visit& visit) const {
@@ -286,9 +321,9 @@ struct ContactEnvironment {
   }
   // calls visit(normal, bound, margin) for all half-spaces of a vertex
   template <class Visit>
-  PD_HD void each_space(int v, const Visit& visit) const {
+  PD_HD void each_space(int v, const Visit& visit, bool planes = true) const {
     PD_UNROLL_4
-    for (int n = a.start[v]; n < a.start[v + 1]; ++n) {
+    for (int n = a.start[v]; planes && n < a.start[v + 1]; ++n) {
       const Four<T> space = a.space[n];
       visit(Vec3<T>{space.x, space.y, space.z}, space.w, a.margin[n]);
     }

@@ -129,7 +129,7 @@ class ContactSearch {
     });
     team.spread(plan.vertices, [&](int v) { a.room[v] = T(HUGE_VAL), a.cursor[v] = 0; });
     team.spread(env_.owners(), [&](int n) { a.owner_near[n] = 0, a.owner_start[n] = 0; });
-    team.spread(1, [&](int) { numbers.listed = numbers.stuck = 0; });
+    team.spread(1, [&](int) { numbers.listed = 0; });
     plan_balls(team);
     const auto most = [&](int v) { return a.ball_most[plan.body[v]]; };
     const bool meets = fit(

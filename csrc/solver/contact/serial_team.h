@@ -34,6 +34,35 @@ struct SerialLanes {
   bool leads() const { return true; }
 };
 
+// A block of items in vector instructions, some of them: lanes past the last one say nothing.
+template <class T>
+struct VectorLanes {
+  static constexpr int width = PD_VECTOR_BYTES / int(sizeof(T));
+  using Number = Pack<T, width>;
+  int first, count;
+
+  Number load(const T* row) const { return Number::load(row + first); }
+  void store(T* row, const Number& value) const { value.store(row + first); }
+  template <class Get>
+  Vec3<Number> vector(const Get& get) const {
+    T number[3][width] = {};
+    for (int lane = 0; lane < count; ++lane) {
+      const auto of = get(first + lane);
+      number[0][lane] = of.x, number[1][lane] = of.y, number[2][lane] = of.z;
+    }
+    return {Number::load(number[0]), Number::load(number[1]), Number::load(number[2])};
+  }
+  template <class Visit>
+  void each(const Visit& visit) const {
+    for (int lane = 0; lane < count; ++lane) visit(first + lane);
+  }
+  bool all(const Mask<T, width>& mask) const {
+    bool holds = true;
+    for (int lane = 0; lane < count; ++lane) holds = holds && mask.m[lane] != 0;
+    return holds;
+  }
+};
+
 class SerialTeam {
   // What a walk found.
   struct Found {
@@ -54,6 +83,8 @@ class SerialTeam {
   };
 
  public:
+  static constexpr bool in_order = true;
+
   template <class Item>
   void spread(std::int64_t count, const Item& item) const {
     for (std::int64_t i = 0; i < count; ++i) item(int(i));
@@ -61,6 +92,12 @@ class SerialTeam {
   template <class Item>
   void each(std::int64_t count, const Item& item) const {
     spread(count, item);
+  }
+  template <class T, class Visit>
+  void blocks(int count, const Visit& visit) const {
+    constexpr int W = VectorLanes<T>::width;
+    for (int first = 0; first < count; first += W)
+      visit(VectorLanes<T>{first, count - first < W ? count - first : W});
   }
   template <class Visit>
   void warps(int count, const Visit& visit) const {

@@ -16,6 +16,17 @@ PD_HD int count_one(int* to) {
 #endif
 }
 
+// Whether it was 0; then it is 1.
+PD_HD bool take_first(int* to) {
+#if defined(__CUDA_ARCH__)
+  return atomicExch(to, 1) == 0;
+#else
+  const bool first = *to == 0;
+  *to = 1;
+  return first;
+#endif
+}
+
 PD_HD void lower(int* to, int value) {
 #if defined(__CUDA_ARCH__)
   atomicMin(to, value);
