@@ -69,7 +69,7 @@ def scene(several: bool) -> pd.Scene:
     """Solids, a cloth that meets itself, and a collider; `several`: some of more than 32 clusters, and of less than one."""
     bodies: list[object] = [
         box((4, 4, 3), (0.0, 0.06, 0.0)),
-        pd.Cloth(level(0.3, 40 if several else 9, 0.115), youngs=1e5, thickness=1e-3, area_density=0.2, bending=1e-5),
+        pd.Cloth(level(0.3, 24 if several else 9, 0.115), youngs=1e5, thickness=1e-3, area_density=0.2, bending=1e-5),
         pd.Collider(level(0.4, 5, 0.0)),
     ]
     if several:

@@ -17,7 +17,7 @@ class ContactSearch {
 
   PD_HD explicit ContactSearch(const Env& env) : env_(env), shapes_(env.plan), boxes_(boxes(env)) {}
 
-  const RestShapes<T>& shapes() const { return shapes_; }
+  PD_HD const RestShapes<T>& shapes() const { return shapes_; }
 
   // Once in a step, when it is known what moves by hand.
   template <class Team>
@@ -118,7 +118,7 @@ class ContactSearch {
   // other side, it takes that: no pair more is listed. Forces are those of the list before, or of
   // the history in a `first` search.
   template <class Team>
-  PD_HD void find(const Team& team, bool first) const {
+  PD_CALLED void find(const Team& team, bool first) const {
     const ContactPlan<T>& plan = env_.plan;
     const ContactArrays<T>& a = env_.a;
     ContactNumbers& numbers = env_.numbers();
