@@ -69,7 +69,7 @@ def _(*args: Any, time_step: float) -> Tensor:
     return adjoint_fallback(*args, time_step=time_step)
 
 
-@torch.library.impl("torchpd::contact_fallback", "cpu")
+@torch.library.impl("torchpd::contact_fallback", ("cpu", "cuda"))
 def _(*args: Any, time_step: float) -> Tensor:
     return adjoint_fallback(*args, time_step=time_step)
 
