@@ -48,10 +48,10 @@ struct Cuda {
   template <class T>
   static void check_pairs(const LoadedPairs<T>& pairs) {
     const std::int64_t bytes = bytes_of_pairs(pairs);
-    TORCH_CHECK_NOT_IMPLEMENTED(
-        bytes <= most_pair_bytes, "gradients of a step with Contact take ", bytes,
-        " bytes on a GPU for an environment of ", pairs.most, " pairs with forces; at most ",
-        most_pair_bytes, " are taken. Coarsen the surfaces, or differentiate on the CPU");
+    TORCH_CHECK_NOT_IMPLEMENTED(bytes <= most_pair_bytes, "gradients of a step with Contact take ",
+                                bytes, " bytes on a GPU for an environment of ", pairs.most,
+                                " pairs with forces; at most ", most_pair_bytes,
+                                " are taken. Coarsen the surfaces, or differentiate on the CPU");
   }
 
   template <class Call>

@@ -129,11 +129,10 @@ class ConjugatePass {
     if constexpr (HasPairs) {
       pairs_.reset(new AdjointPairs<T, OneThread>(*call_.pairs, plan_.vertex_order, one_,
                                                   storage_->memory(environment_), environment_));
-      pairs_->read([&](int i) -> T& { return w_.inverse[i]; },
-                   [&](int i) { return projector(i); }, [&](int i) { return sliding(i); },
-                   [&](std::int64_t low, std::int64_t square) {
-                     return storage_->factors(low, square);
-                   });
+      pairs_->read(
+          [&](int i) -> T& { return w_.inverse[i]; }, [&](int i) { return projector(i); },
+          [&](int i) { return sliding(i); },
+          [&](std::int64_t low, std::int64_t square) { return storage_->factors(low, square); });
     }
   }
 

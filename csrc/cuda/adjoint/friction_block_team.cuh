@@ -117,10 +117,7 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
 
   // Replaces the solution y by the multiplier G^T y.
   __device__ void press_solution() {
-    if constexpr (has_pairs) {
-      team_.barrier();
-      pairs_.slant(m_.solution);
-    }
+    if constexpr (has_pairs) pairs_.slant(m_.solution);
     each_vertex([&](int i) { m_.solution[i] = quad(press(vec3(m_.solution[i]), i)); });
   }
 
@@ -167,9 +164,8 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
   __device__ void multiply(FrictionStage stage) {
     const T per_unit = T(1) / unit_;
     const auto left = [&](int i, const Vec3<T>& image) {
-      return stage == FrictionStage::residual
-                 ? per_unit * read3(call_.right + 3 * row(i)) - image
-                 : image;
+      return stage == FrictionStage::residual ? per_unit * read3(call_.right + 3 * row(i)) - image
+                                              : image;
     };
     double sum[2] = {0, 0};
     const auto store = [&](int part) {

@@ -49,26 +49,24 @@ struct PairSizes {
   std::int64_t bodies = 0;
 
   PD_HD std::int64_t rows() const { return 3 * pairs; }
-  PD_HD std::int64_t columns() const {
-    return rows() < 3 * vertices ? rows() : 3 * vertices;
-  }
+  PD_HD std::int64_t columns() const { return rows() < 3 * vertices ? rows() : 3 * vertices; }
 };
 
 struct PairMemory {
   PairItem* item;
   PairRow* row;
   PairPatch* patch;
-  int* slot;              // [keys + 1] items before each key
-  int* internal;          // [vertices] internal numbers of the user's
-  int *start, *entry;     // of the nodes: 4 item + corner
-  int *least, *cursor;    // [nodes]
+  int* slot;                  // [keys + 1] items before each key
+  int* internal;              // [vertices] internal numbers of the user's
+  int *start, *entry;         // of the nodes: 4 item + corner
+  int *least, *cursor;        // [nodes]
   int *label, *other, *size;  // [pairs]
-  int *pivot, *of_patch;  // [columns] rows, and patches
-  int* order;             // [columns]
+  int *pivot, *of_patch;      // [columns] rows, and patches
+  int* order;                 // [columns]
   PairCounts* counts;
-  double* inverse;        // [vertices] 1 / D
-  double* spread;         // [nodes]
-  Vec3<double>* field;    // [nodes]
+  double* inverse;                                // [vertices] 1 / D
+  double* spread;                                 // [nodes]
+  Vec3<double>* field;                            // [nodes]
   Vec3<double>*part, *part_of_start;              // [4 pairs]
   double *whole, *left, *column, *along, *found;  // [rows]
   double *sums, *turned;                          // [columns]

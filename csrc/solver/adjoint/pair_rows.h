@@ -136,8 +136,7 @@ class PairRows {
   // to <- L_r^-T from
   PD_HD void upper(const double* from, double* to) const {
     team_.dots(
-        m_.counts->pivots,
-        [&](int n) { return patch_of(n).first_pivot + patch_of(n).rank - n; },
+        m_.counts->pivots, [&](int n) { return patch_of(n).first_pivot + patch_of(n).rank - n; },
         [&](int n, int i) {
           const PairPatch& patch = patch_of(n);
           const int own = n - patch.first_pivot;
@@ -211,8 +210,8 @@ class PairRows {
 
   // Row p D^-1 C_q^T
   PD_HD double coupled(int p, int q) const {
-    const int *const of_p = m_.item[m_.row[p].item].moves,
-              *const of_q = m_.item[m_.row[q].item].moves;
+    const int *const of_p = m_.item[m_.row[p].item].moves, *const of_q =
+                                                               m_.item[m_.row[q].item].moves;
     double sum = 0;
     for (int b = 0; b < 4; ++b) {
       for (int a = 0; a < 4; ++a) {
@@ -272,8 +271,7 @@ class PairRows {
           const double* const other = to + std::int64_t(k) * rank + first;
           for (int u = 0; u < width; ++u) own[u] -= of[k] * other[u];
         }
-        for (int u = 0; u < width; ++u)
-          to[std::int64_t(i) * rank + first + u] = own[u] / of[i];
+        for (int u = 0; u < width; ++u) to[std::int64_t(i) * rank + first + u] = own[u] / of[i];
       }
     });
     team_.grid(rank, rank, [&](int i, int j) {
@@ -300,9 +298,8 @@ class PairRows {
       });
       team_.each(rank, [&](int j) {
         double sum = 0;
-        each_held(m_.pivot[patch.first_pivot + j], [&](int v, const Place& c) {
-          sum += m_.inverse[v] * dot(m_.field[v], c);
-        });
+        each_held(m_.pivot[patch.first_pivot + j],
+                  [&](int v, const Place& c) { sum += m_.inverse[v] * dot(m_.field[v], c); });
         to[std::int64_t(i) * rank + j] = sum;
       });
     }

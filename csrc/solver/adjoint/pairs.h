@@ -72,7 +72,8 @@ class AdjointPairs {
       if (positive) {
         double turned = 0;
         for (int b = 0; b < 4; ++b)
-          turned += weight[b] * dot(item.slopes.across, Place{l[3 * b], l[3 * b + 1], l[3 * b + 2]});
+          turned +=
+              weight[b] * dot(item.slopes.across, Place{l[3 * b], l[3 * b + 1], l[3 * b + 2]});
         m_.part[n] = (item.slopes.stiffness * weight[a] * turned) * item.slopes.across;
         return;
       }
@@ -91,8 +92,7 @@ class AdjointPairs {
   PD_CALLED void differentiate(const Read& read, double* nu, const PairGradients<T>& out) const {
     const int pairs = m_.counts->pairs;
     // in newtons and so on, from those of scaled rows
-    team_.each(m_.counts->rows,
-               [&](int p) { nu[p] *= sqrt(m_.item[m_.row[p].item].step); });
+    team_.each(m_.counts->rows, [&](int p) { nu[p] *= sqrt(m_.item[m_.row[p].item].step); });
     team_.each(4 * std::int64_t(pairs), [&](int n) {
       const PairItem& item = m_.item[n / 4];
       double l[12], end[3], start[3];
@@ -220,7 +220,8 @@ class AdjointPairs {
     std::int64_t begin = 0, end = plan_.rest_pairs;
     while (begin < end) {
       const std::int64_t middle = (begin + end) / 2;
-      (plan_.rest_key[middle] < key ? begin : end) = plan_.rest_key[middle] < key ? middle + 1 : middle;
+      (plan_.rest_key[middle] < key ? begin : end) =
+          plan_.rest_key[middle] < key ? middle + 1 : middle;
     }
     return begin < plan_.rest_pairs && plan_.rest_key[begin] == key;
   }
@@ -232,9 +233,8 @@ class AdjointPairs {
     team_.each(corners_count, [&](int n) { team_.add(m_.start + m_.item[n / 4].node[n % 4], 1); });
     team_.scan(m_.start, plan_.vertices);
     team_.each(plan_.vertices, [&](int v) { m_.cursor[v] = m_.start[v]; });
-    team_.each(corners_count, [&](int n) {
-      m_.entry[team_.add(m_.cursor + m_.item[n / 4].node[n % 4], 1)] = n;
-    });
+    team_.each(corners_count,
+               [&](int n) { m_.entry[team_.add(m_.cursor + m_.item[n / 4].node[n % 4], 1)] = n; });
     // they came in the order of threads
     team_.each(plan_.vertices, [&](int v) {
       for (int n = m_.start[v] + 1; n < m_.start[v + 1]; ++n) {
@@ -422,8 +422,7 @@ class AdjointPairs {
     const std::int64_t tables = std::int64_t(plan_.bodies) * plan_.bodies;
     team_.each(tables, [&](int n) { m_.friction[n] = 0; });
     team_.once([&] {
-      for (int n = 0; n < m_.counts->pairs; ++n)
-        m_.friction[m_.item[n].bodies] += m_.along[n];
+      for (int n = 0; n < m_.counts->pairs; ++n) m_.friction[m_.item[n].bodies] += m_.along[n];
     });
     team_.each(tables, [&](int n) { to[n] = T(m_.friction[n]); });
   }
