@@ -354,7 +354,9 @@ def _contact_backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
     )
     rows = iter(asked)
     of_contact: list[Tensor | None] = [None] * count_contact
-    of_contact[CONTACT_FRICTION], of_contact[CONTACT_THICKNESS] = friction, thickness
+    of_contact[CONTACT_FRICTION] = friction
+    if ctx.needs_input_grad[7][CONTACT_THICKNESS]:  # a number of the host
+        of_contact[CONTACT_THICKNESS] = thickness.cpu()
     return (
         x,
         v,
