@@ -1,6 +1,6 @@
 // Elastic energy and its derivatives at given positions, in one pass over the patches of any plan.
 #pragma once
-#include "cuda/common/arena.h"
+#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/reductions.h"
 #include "cuda/common/runtime.h"

@@ -1,6 +1,6 @@
 // The numbers of a step of all stencils, computed once a call from the rows of the material.
 #pragma once
-#include "cuda/common/arena.h"
+#include "views/arena.h"
 #include "cuda/elements/stencils.h"
 
 #include <cuda_runtime.h>

@@ -1,6 +1,6 @@
 // Kernels of cuda/contact/launch.h: a team of blocks takes one environment after another.
 #pragma once
-#include "cuda/common/arena.h"
+#include "views/arena.h"
 #include "cuda/common/inputs.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/teams.cuh"

@@ -1,6 +1,6 @@
 // Launch of the fused kernel in one precision.
 #pragma once
-#include "cuda/common/arena.h"
+#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/runtime.h"
 #include "cuda/fused/kernels.cuh"

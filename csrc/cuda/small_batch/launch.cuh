@@ -1,6 +1,6 @@
 // The small-batch kernel and its launch.
 #pragma once
-#include "cuda/common/arena.h"
+#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/runtime.h"
 #include "cuda/small_batch/block_shape.h"

@@ -1,7 +1,7 @@
 // Runs solver/step.h on the host: every part of a step is a launch. It supports every mesh, effect
 // and batch.
 #pragma once
-#include "cuda/common/arena.h"
+#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/teams.cuh"
