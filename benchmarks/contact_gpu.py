@@ -8,6 +8,7 @@ sphere  a cloth of 40 x 40 vertices over a rigid sphere
 fold    one cloth that lies on itself
 
 python benchmarks/contact_gpu.py --out contact-gpu.json
+python benchmarks/contact_gpu.py --gradients --batch 512    a step and its backward pass, without a graph
 """
 
 from __future__ import annotations
@@ -116,6 +117,51 @@ def measure(name: str, batch: int, steps: int, iterations: int, profile: bool) -
     return row
 
 
+def measure_gradients(name: str, batch: int, steps: int, iterations: int) -> Row:
+    """A training step: one step of all environments, and the gradient of a loss by state, stiffness and friction."""
+    scene = pd.Scene(*SCENES[name][0](), pd.Gravity())
+    sim = pd.Simulator(scene, iterations=iterations, progress=False, device=GPU, batch=batch)
+    state: Any = sim.rest_state(batch)
+    with torch.no_grad():
+        for _ in range(SETTLES):
+            state = sim(state)
+    sim.contact_friction = torch.full((), 0.4, device=GPU, requires_grad=True)
+    sim.stiffness.requires_grad_()
+    torch.cuda.reset_peak_memory_stats()
+    marks = [torch.cuda.Event(enable_timing=True) for _ in range(3)]
+    spent = torch.zeros(2)
+    for number in range(steps + 1):
+        x, v = state.positions.clone().requires_grad_(), state.velocities.clone().requires_grad_()
+        marks[0].record()
+        after = sim(pd.HistoryState(x, v, state.history))
+        loss = after.positions.square().sum()
+        marks[1].record()
+        loss.backward()
+        marks[2].record()
+        torch.cuda.synchronize()
+        if number:  # the first one loads kernels
+            spent += torch.tensor([marks[n].elapsed_time(marks[n + 1]) for n in range(2)])
+        assert x.grad is not None
+        assert bool(x.grad.isfinite().all())
+    forward, backward = (spent / steps).tolist()
+    row: Row = {
+        "scene": name,
+        "batch": batch,
+        "vertices": sim.vertices,
+        "forces": float((state.history.forces[..., 0] > 0).sum()) / batch,
+        "forward_milliseconds": forward,
+        "backward_milliseconds": backward,
+        "environment_steps_per_second": batch / (forward + backward) * 1e3,
+        "gibibytes": torch.cuda.max_memory_allocated() / 2**30,
+    }
+    print(
+        f"{name:<7}{batch:6} x{row['vertices']:7} vertices, {row['forces']:8.0f} forces: forward {forward:8.2f} ms, "
+        f"backward {backward:8.2f} ms, {row['environment_steps_per_second']:8.0f} /s, {row['gibibytes']:.2f} GiB",
+        flush=True,
+    )
+    return row
+
+
 def counts(sim: pd.Simulator, state: Any) -> torch.Tensor:
     """Numbers of the contact of one more step [B, 8], columns in csrc/contact/views.h."""
     assert sim.body_contact is not None
@@ -135,11 +181,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10, help="that are timed")
     parser.add_argument("--iterations", type=int, default=64)
     parser.add_argument("--batch", type=int, nargs="+", help="environments, instead of those of the scenes")
+    parser.add_argument("--gradients", action="store_true", help="steps and their backward passes")
     parser.add_argument("--profile", action="store_true", help="print the kernels that take longest")
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()
     rows = [
-        measure(name, batch, options.steps, options.iterations, options.profile)
+        measure_gradients(name, batch, options.steps, options.iterations)
+        if options.gradients
+        else measure(name, batch, options.steps, options.iterations, options.profile)
         for name in options.scenes
         for batch in options.batch or SCENES[name][1]
     ]

@@ -1,8 +1,8 @@
-// The op of the adjoint of a step with contact between bodies: see contact/pairs/curvature.h and cpu/adjoint/pair_rows.h.
+// The op of the adjoint of a step with contact between bodies: see contact/pairs/curvature.h and solver/adjoint/pair_rows.h.
 #pragma once
 #include "binding/adjoint_ops.h"
 #include "binding/contact_ops.h"
-#include "cpu/adjoint/pair_views.h"
+#include "solver/adjoint/pair_views.h"
 
 #include <cstdint>
 #include <limits>
@@ -22,13 +22,14 @@ enum LoadedPairsTensor : int {
   pairs_contact
 };
 
-template <class T>
-LoadedPairs<T> loaded_pairs_view(at::TensorList pairs, std::int64_t batch, std::int64_t vertices) {
+// Of a Backend that counts loaded pairs by `most_loaded(forces)`, and refuses more than it takes by `check_pairs`.
+template <class Backend, class T>
+LoadedPairs<T> loaded_pairs_view(at::TensorList pairs, std::int64_t batch, std::int64_t vertices,
+                                 const Place& place) {
   constexpr int arrays = int(pairs_contact) + int(contact_array_count);
   TORCH_CHECK_VALUE(pairs.size() == arrays, "pairs must have ", arrays, " arrays, got ",
                     pairs.size());
   LoadedPairs<T> view;
-  const Place place{at::kCPU};
   view.plan = contact_plan_view<T>(pairs.slice(pairs_contact), vertices, place);
   const auto check = [&](LoadedPairsTensor which, at::ScalarType type, at::IntArrayRef shape,
                          const char* meaning) {
@@ -49,6 +50,8 @@ LoadedPairs<T> loaded_pairs_view(at::TensorList pairs, std::int64_t batch, std::
   check(pairs_keys, at::kLong, {batch, m}, "pairs with forces");
   view.keys = pairs[pairs_keys].const_data_ptr<std::int64_t>();
   view.forces = reals(pairs_forces, {batch, m, 4}, "N");
+  view.most = Backend::most_loaded(pairs[pairs_forces]);
+  Backend::check_pairs(view);
   return view;
 }
 
@@ -69,10 +72,12 @@ PairTensors pair_gradients_typed(const SolvedAdjoint& s, at::TensorList pairs,
                                  at::TensorList plan) {
   PairGradientsCall<T> call;
   const Place place{s.multiplier.device()};
-  call.plan = Backend::template plan_view<T>(plan, place);
+  const auto solids = Backend::template plan_view<T>(plan, place);
+  call.vertex_order = solids.vertex_order;
+  call.vertices = solids.vertices;
   call.batch = s.multiplier.size(0);
-  const std::int64_t b = call.batch, vertices = call.plan.vertices;
-  call.pairs = loaded_pairs_view<T>(pairs, b, vertices);
+  const std::int64_t b = call.batch, vertices = call.vertices;
+  call.pairs = loaded_pairs_view<Backend, T>(pairs, b, vertices, place);
   const std::int64_t c = call.pairs.plan.colliders, q = call.pairs.plan.bodies;
   std::vector<Tensor> kept;
   const auto keep = [&](const Tensor& tensor) {
@@ -95,7 +100,7 @@ PairTensors pair_gradients_typed(const SolvedAdjoint& s, at::TensorList pairs,
   call.out = {out.end.mutable_data_ptr<T>(),       out.start.mutable_data_ptr<T>(),
               out.poses_end.mutable_data_ptr<T>(), out.poses_start.mutable_data_ptr<T>(),
               out.friction.mutable_data_ptr<T>(),  out.thickness.mutable_data_ptr<T>()};
-  if (b > 0) Backend::pair_gradients(call);
+  if (b > 0) Backend::pair_gradients(call, s.multiplier);
   return out;
 }
 

@@ -122,10 +122,10 @@ struct Cpu {
       }
     });
   }
-  static void pair_gradients(const PairGradientsCall<float>& call) {
+  static void pair_gradients(const PairGradientsCall<float>& call, const Tensor&) {
     kernels().pair_gradients32(call, threads());
   }
-  static void pair_gradients(const PairGradientsCall<double>& call) {
+  static void pair_gradients(const PairGradientsCall<double>& call, const Tensor&) {
     kernels().pair_gradients64(call, threads());
   }
   static void rotation(const RotationCall<float>& call, const Tensor&) {
@@ -139,8 +139,12 @@ struct Cpu {
   static std::optional<LoadedPairs<T>> loaded_pairs(at::TensorList pairs, std::int64_t batch,
                                                     std::int64_t vertices) {
     if (pairs.empty()) return {};
-    return loaded_pairs_view<T>(pairs, batch, vertices);
+    return loaded_pairs_view<Cpu, T>(pairs, batch, vertices, Place{at::kCPU});
   }
+  // each environment has the memory that its own take
+  static std::int64_t most_loaded(const Tensor&) { return 0; }
+  template <class T>
+  static void check_pairs(const LoadedPairs<T>&) {}
 
   static bool recording(const Tensor&) { return false; }
 

@@ -1,7 +1,7 @@
 // Which compiled instruction set this machine runs.
 #pragma once
 #include "contact/views.h"
-#include "cpu/adjoint/pair_views.h"
+#include "solver/adjoint/pair_views.h"
 #include "views/views.h"
 
 #include <string>

@@ -489,7 +489,7 @@ struct AdjointResultCall {
 };
 
 template <class T>
-struct LoadedPairs;  // cpu/adjoint/pair_views.h
+struct LoadedPairs;  // solver/adjoint/pair_views.h
 
 // An environment's entries in the progress of a solve: r . z; |right side|; 1 while it runs, 0 after, -1 before; and
 // the residual relative to the right side. The first iteration computes the other entries from a residual that equals
@@ -536,7 +536,7 @@ struct ConjugateCall : P::EffectViews {
   double* progress = nullptr;             // [batch, progress_count]
   double tolerance = 0;                   // of the residual, relative to the right side
   int iterations = 0;                     // counts products if friction follows
-  const LoadedPairs<T>* pairs = nullptr;  // of surfaces, on a CPU from zero alone; may be null
+  const LoadedPairs<T>* pairs = nullptr;  // of surfaces; may be null
 };
 
 // Applies the approximation of A^-1 to a vector for each vertex.

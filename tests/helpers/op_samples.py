@@ -90,12 +90,11 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
 
 
 def samples_of_contact(x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
-    """Arguments of the ops of a step with contact between bodies, on the CPU."""
-    if x.is_cuda:
-        return {}
+    """Arguments of the ops of a step with contact between bodies."""
     mesh = pd.shapes.box((0.1,) * 3, (1,) * 3)
     cubes = [pd.Solid(mesh.translated((0.01 * n, 0.102 * n, 0.0)), youngs=1e5, density=1000.0) for n in range(2)]
-    sim = pd.Simulator(pd.Scene(*cubes, pd.Contact(friction=0.3, thickness=1e-3)), dtype=x.dtype, progress=False)
+    scene = pd.Scene(*cubes, pd.Contact(friction=0.3, thickness=1e-3))
+    sim = pd.Simulator(scene, dtype=x.dtype, device=x.device, progress=False)
     assert sim.body_contact is not None
     state: Any = sim.rest_state(BATCH)
     state.velocities[:, 8:, 1] = -0.5
@@ -112,7 +111,7 @@ def samples_of_contact(x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, 
     moving = [array.detach().clone().requires_grad_() for array in state[:2]]
     solve = (after, f, inertia, 1.0 / (inertia + 1e4), None, material, plan, None, None, pairs)
     history, back = [poses, actual, keys, forces], numbers[:, 1] > 0
-    errors = torch.tensor([0.0, 2.0, 1.0], dtype=torch.float64)
+    errors = torch.tensor([0.0, 2.0, 1.0], dtype=torch.float64, device=x.device)
     return {
         "contact_step": (
             (*moving, None, poses, [poses, *state.history[1:3]], material, plan, trained), settings_of(sim),
@@ -125,7 +124,7 @@ def samples_of_contact(x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, 
     }  # fmt: skip
 
 
-OF_CONTACT = ("contact_step", "contact_conjugate", "contact_fallback", "contact_step_vjp")  # on the CPU alone
+OF_CONTACT = ("contact_step", "contact_conjugate", "contact_fallback", "contact_step_vjp")
 OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "rollout_vjp", "conjugate_gradients_",

@@ -69,7 +69,7 @@ def _(*args: Any, time_step: float) -> Tensor:
     return adjoint_fallback(*args, time_step=time_step)
 
 
-@torch.library.impl("torchpd::contact_fallback", "cpu")
+@torch.library.impl("torchpd::contact_fallback", ("cpu", "cuda"))
 def _(*args: Any, time_step: float) -> Tensor:
     return adjoint_fallback(*args, time_step=time_step)
 
@@ -354,7 +354,9 @@ def _contact_backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
     )
     rows = iter(asked)
     of_contact: list[Tensor | None] = [None] * count_contact
-    of_contact[CONTACT_FRICTION], of_contact[CONTACT_THICKNESS] = friction, thickness
+    of_contact[CONTACT_FRICTION] = friction
+    if ctx.needs_input_grad[7][CONTACT_THICKNESS]:  # a number of the host
+        of_contact[CONTACT_THICKNESS] = thickness.cpu()
     return (
         x,
         v,

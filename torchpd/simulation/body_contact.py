@@ -103,8 +103,6 @@ class BodyContact:
                 "the way of; leave it out"
             )
         self.check_transforms(state[0], state[1], *material)
-        if state[0].is_cuda:
-            _refuse_gradients(state, forces, poses, [*material, self.friction])
         before = ContactHistory(*state[2])  # type: ignore[misc]
         history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.detach().contiguous()]
         wanted = history[0] if poses is None else poses.contiguous()
@@ -183,21 +181,3 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     moved = [array.to(device) for array in (*map(whole, [*surfaces, *search]), keys, *map(real, reals))]
     return [sizes, *moved, real([plan.thickness])]
-
-
-def _refuse_gradients(
-    state: State | HistoryState, forces: Tensor | None, poses: Tensor | None, material: list[Tensor]
-) -> None:
-    """Refuse inputs that require gradients, on a GPU."""
-    if not torch.is_grad_enabled():
-        return
-    named = {"positions": state[0], "velocities": state[1], "forces": forces, "poses of colliders": poses}
-    named["history.poses"] = state[2][0]  # type: ignore[misc]
-    name = next((name for name, array in named.items() if array is not None and array.requires_grad), None)
-    if name is None and any(array.requires_grad for array in material):
-        name = "material, targets or friction"
-    if name is not None:
-        raise RuntimeError(
-            f"a step with Contact on a GPU must not require gradients, got {name} that do; its derivative is provided "
-            "on the CPU: step there, detach() them, or step under torch.no_grad()"
-        )

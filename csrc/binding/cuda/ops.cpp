@@ -1,9 +1,9 @@
 // The ops on CUDA. Torch provides memory, stream and device.
 #include "binding/rollout_adjoint.h"
 
+#include "binding/contact_adjoint_ops.h"
 #include "binding/contact_ops.h"
 #include "binding/plan_views.h"
-#include "cpu/adjoint/pair_views.h"
 #include "cuda/common/launch.h"
 #include "cuda/poisson/launch.h"
 
@@ -34,11 +34,24 @@ struct Cuda {
   using Conjugate = Mixed<DeviceConjugate<T>>;
 
   template <class T>
-  static std::optional<LoadedPairs<T>> loaded_pairs(at::TensorList pairs, std::int64_t,
-                                                    std::int64_t) {
-    TORCH_CHECK_NOT_IMPLEMENTED(pairs.empty(),
-                                "conjugate_gradients takes pairs of surfaces on a CPU alone");
-    return {};
+  static std::optional<LoadedPairs<T>> loaded_pairs(at::TensorList pairs, std::int64_t batch,
+                                                    std::int64_t vertices) {
+    if (pairs.empty()) return {};
+    return loaded_pairs_view<Cuda, T>(pairs, batch, vertices, Place{pairs[0].device()});
+  }
+  // Waits for the GPU, so that memory is for the pairs that there are. A recording cannot read them.
+  static std::int64_t most_loaded(const Tensor& forces) {
+    if (recording(forces)) return forces.size(1);
+    return forces.numel() == 0 ? 0
+                               : forces.select(-1, 0).gt(0).sum(1).max().item().to<std::int64_t>();
+  }
+  template <class T>
+  static void check_pairs(const LoadedPairs<T>& pairs) {
+    const std::int64_t bytes = bytes_of_pairs(pairs);
+    TORCH_CHECK_NOT_IMPLEMENTED(bytes <= most_pair_bytes, "gradients of a step with Contact take ",
+                                bytes, " bytes on a GPU for an environment of ", pairs.most,
+                                " pairs with forces; at most ", most_pair_bytes,
+                                " are taken. Coarsen the surfaces, or differentiate on the CPU");
   }
 
   template <class Call>
@@ -163,6 +176,7 @@ struct Cuda {
 
   template <class T>
   static void conjugate(const Conjugate<T>& call, const Tensor& like) {
+    if (call.pairs) return contact_conjugate(call, like);
     if (runs_with_poisson(call)) {
       const Conjugate<T> own = with_poisson(call);
       is_mixed(own)
@@ -173,6 +187,24 @@ struct Cuda {
       is_mixed(call) ? run(like, call, mixed_conjugate_bytes<T>, run_mixed_conjugate<T>)
                      : run<DeviceConjugate<T>>(like, call, conjugate_bytes<T>, run_conjugate<T>);
     }
+  }
+
+  template <class T>
+  static void contact_conjugate(const Conjugate<T>& call, const Tensor& like) {
+    TORCH_CHECK_VALUE(call.plan.kernel == int(DeviceKernel::stream),
+                      "plan must be one for kernel 3 (stream) in a scene with Contact, got kernel ",
+                      call.plan.kernel, "; compile the scene again");
+    if (runs_with_poisson(call)) {
+      run(like, with_poisson(call), poisson::contact_conjugate_bytes<T>,
+          poisson::run_contact_conjugate<T>);
+    } else {
+      run(like, call, contact_conjugate_bytes<T>, run_contact_conjugate<T>);
+    }
+  }
+
+  template <class T>
+  static void pair_gradients(const PairGradientsCall<T>& call, const Tensor& like) {
+    run(like, call, pair_gradients_bytes<T>, run_pair_gradients<T>);
   }
 
   template <class T>
@@ -227,6 +259,7 @@ TORCH_LIBRARY_IMPL(torchpd, CUDA, m) {
   register_ops<Cuda>(m);
   register_adjoint_ops<Cuda>(m);
   register_contact_ops<Cuda>(m);
+  register_contact_adjoint<Cuda>(m);
 }
 
 }  // namespace pd

@@ -30,13 +30,18 @@ struct PairFeature {
   signed char plus, minus, moves, to[2], from[2];
 };
 
-constexpr PairFeature point_features[] = {
-    {0, 1, 2, {1, 1}, {2, 3}}, {0, 1, 1, {1}, {2}}, {0, 2, 1, {2}, {3}}, {0, 3, 1, {3}, {1}},
-    {0, 1, 0, {}, {}},         {0, 2, 0, {}, {}},   {0, 3, 0, {}, {}}};
-constexpr PairFeature edge_features[] = {
-    {0, 2, 2, {1, 2}, {0, 3}}, {0, 2, 1, {2}, {3}}, {1, 2, 1, {2}, {3}},
-    {0, 2, 1, {1}, {0}},       {0, 3, 1, {1}, {0}}, {0, 2, 0, {}, {}},
-    {0, 3, 0, {}, {}},         {1, 2, 0, {}, {}},   {1, 3, 0, {}, {}}};
+// Those of a point and a triangle, or of two edges, that with most shares first.
+constexpr int point_features = 7, edge_features = 9;
+PD_HD PairFeature pair_feature(bool edges, int number) {
+  constexpr PairFeature points[point_features] = {
+      {0, 1, 2, {1, 1}, {2, 3}}, {0, 1, 1, {1}, {2}}, {0, 2, 1, {2}, {3}}, {0, 3, 1, {3}, {1}},
+      {0, 1, 0, {}, {}},         {0, 2, 0, {}, {}},   {0, 3, 0, {}, {}}};
+  constexpr PairFeature lines[edge_features] = {
+      {0, 2, 2, {1, 2}, {0, 3}}, {0, 2, 1, {2}, {3}}, {1, 2, 1, {2}, {3}},
+      {0, 2, 1, {1}, {0}},       {0, 3, 1, {1}, {0}}, {0, 2, 0, {}, {}},
+      {0, 3, 0, {}, {}},         {1, 2, 0, {}, {}},   {1, 3, 0, {}, {}}};
+  return edges ? lines[number] : points[number];
+}
 
 // Weights of the closest points of a feature. With two shares and N = v_1 x v_2 the difference is
 // along N: share_1 = -(s x v_2).N / N.N, share_2 = -(v_1 x s).N / N.N.
@@ -66,13 +71,13 @@ PD_HD void feature_weights(const PairFeature& of, const Vec3<R> (&corner)[4], R 
 // The nearest feature. One with two shares is the nearest wherever its closest points are inside.
 template <class T>
 PD_HD PairFeature nearest_feature(bool edges, const Vec3<T> (&corner)[4]) {
-  const PairFeature* const rows = edges ? edge_features : point_features;
-  const int count = edges ? int(std::size(edge_features)) : int(std::size(point_features));
-  PairFeature best = rows[0];
+  const int count = edges ? edge_features : point_features;
+  PairFeature best = pair_feature(edges, 0);
   T least = T(HUGE_VAL);
   for (int n = 0; n < count; ++n) {
+    const PairFeature feature = pair_feature(edges, n);
     T weight[4];
-    feature_weights(rows[n], corner, weight);
+    feature_weights(feature, corner, weight);
     bool inside = true;
     for (int a = 0; a < 4; ++a) {
       const T signed_weight = a == 0 || (a == 1 && edges) ? weight[a] : -weight[a];
@@ -81,7 +86,7 @@ PD_HD PairFeature nearest_feature(bool edges, const Vec3<T> (&corner)[4]) {
     const Vec3<T> diff = combined(weight, corner);
     const T square = dot(diff, diff);
     if (!inside || !(square < least)) continue;
-    best = rows[n];
+    best = feature;
     least = square;
     if (best.moves == 2) break;
   }
@@ -205,7 +210,37 @@ PD_HD LoadedPair<T> loaded_pair(bool edges, const Vec3<T> (&end)[4], const Vec3<
   return pair;
 }
 
-// First derivatives of a loaded pair. Numbers 3 a + i are component i of corner a.
+// Derivatives of a loaded pair by one number of its corners, at the end or at the start. Number
+// 3 a + i is component i of corner a.
+template <class T>
+struct PairSlope {
+  T load[12];  // of -w (x) f
+  T row[3];    // of the gap and of the slips
+
+  PD_HD PairSlope(const LoadedPair<T>& pair, const Vec3<T> (&end)[4], const Vec3<T> (&start)[4],
+                  bool by_end, int j) {
+    using D = Dual<T>;
+    const auto number = [&](T value, int own, bool varies) {
+      return D(value, T(varies && own == j ? 1 : 0));
+    };
+    Vec3<D> after[4], before[4];
+    for (int a = 0; a < 4; ++a) {
+      after[a] = {number(end[a].x, 3 * a, by_end), number(end[a].y, 3 * a + 1, by_end),
+                  number(end[a].z, 3 * a + 2, by_end)};
+      before[a] = {number(start[a].x, 3 * a, !by_end), number(start[a].y, 3 * a + 1, !by_end),
+                   number(start[a].z, 3 * a + 2, !by_end)};
+    }
+    const PairTerms<D> terms = pair_terms(pair, after, before);
+    for (int a = 0; a < 4; ++a) {
+      const Vec3<D> of = terms.frame.weight[a] * terms.force;
+      load[3 * a] = -of.x.slope, load[3 * a + 1] = -of.y.slope, load[3 * a + 2] = -of.z.slope;
+    }
+    row[0] = terms.frame.distance.slope;
+    row[1] = terms.slip[0].slope, row[2] = terms.slip[1].slope;
+  }
+};
+
+// First derivatives of a loaded pair.
 template <class T>
 struct PairSlopes {
   T load[12][12];   // of -w (x) f, by the corners at the end
@@ -215,8 +250,8 @@ struct PairSlopes {
   T stiffness;
   Vec3<T> across;
 
+  // All but the derivatives, which `differentiate` finds.
   PD_HD void set(const LoadedPair<T>& pair, const Vec3<T> (&end)[4], const Vec3<T> (&start)[4]) {
-    differentiate(pair, end, start, true, load, row);
     const PairTerms<T> terms = pair_terms(pair, end, start);
     const T lambda = pair.normal_force;
     const bool slides = pair.state == PairState::slides;
@@ -234,31 +269,12 @@ struct PairSlopes {
     across = (slides ? T(1) / length : T(0)) * cross(terms.frame.normal, slip);
   }
 
-  // Derivatives by the corners at the end or at the start.
-  PD_HD static void differentiate(const LoadedPair<T>& pair, const Vec3<T> (&end)[4],
-                                  const Vec3<T> (&start)[4], bool by_end, T (&load)[12][12],
-                                  T (&row)[3][12]) {
-    using D = Dual<T>;
-    for (int j = 0; j < 12; ++j) {
-      const auto number = [&](T value, int own, bool varies) {
-        return D(value, T(varies && own == j ? 1 : 0));
-      };
-      Vec3<D> after[4], before[4];
-      for (int a = 0; a < 4; ++a) {
-        after[a] = {number(end[a].x, 3 * a, by_end), number(end[a].y, 3 * a + 1, by_end),
-                    number(end[a].z, 3 * a + 2, by_end)};
-        before[a] = {number(start[a].x, 3 * a, !by_end), number(start[a].y, 3 * a + 1, !by_end),
-                     number(start[a].z, 3 * a + 2, !by_end)};
-      }
-      const PairTerms<D> terms = pair_terms(pair, after, before);
-      for (int a = 0; a < 4; ++a) {
-        const Vec3<D> of = terms.frame.weight[a] * terms.force;
-        load[3 * a][j] = -of.x.slope, load[3 * a + 1][j] = -of.y.slope;
-        load[3 * a + 2][j] = -of.z.slope;
-      }
-      row[0][j] = terms.frame.distance.slope;
-      row[1][j] = terms.slip[0].slope, row[2][j] = terms.slip[1].slope;
-    }
+  // Derivatives by number j of the corners at the end.
+  PD_HD void differentiate(const LoadedPair<T>& pair, const Vec3<T> (&end)[4],
+                           const Vec3<T> (&start)[4], int j) {
+    const PairSlope<T> slope(pair, end, start, true, j);
+    for (int i = 0; i < 12; ++i) load[i][j] = slope.load[i];
+    for (int k = 0; k < 3; ++k) row[k][j] = slope.row[k];
   }
 };
 

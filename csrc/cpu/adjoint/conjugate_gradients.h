@@ -1,6 +1,6 @@
 // Runner of solver/adjoint/conjugate_gradients.h: one environment at a time, by one thread or by a team.
 #pragma once
-#include "cpu/adjoint/pairs.h"
+#include "cpu/adjoint/pair_storage.h"
 #include "cpu/adjoint/rotation_jacobians.h"
 #include "cpu/multilevel/v_cycle.h"
 #include "cpu/step/sweep.h"
@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cmath>
 #include <memory>
+#include <optional>
 
 namespace pd::inline PD_TARGET {
 
@@ -39,15 +40,13 @@ struct ConjugateMemory {
   RotationJacobians<T> jacobians;
   std::unique_ptr<Cycle<Single<T>>> cycle;  // null without levels
   FrictionVectors<T> friction;
-  std::unique_ptr<AdjointPairs<T>> pairs;  // null without pairs
+  std::optional<PairStorage<T>> pairs;
 
   explicit ConjugateMemory(const ConjugateCall<T>& call)
       : vectors(call),
         jacobians(call.plan, call.effects.poisson.data != nullptr),
         friction(call.friction ? call.plan.vertices : 0, HasPairs) {
-    if constexpr (HasPairs)
-      pairs = std::make_unique<AdjointPairs<T>>(*call.pairs, call.plan.vertex_order,
-                                                call.plan.vertices);
+    if constexpr (HasPairs) pairs.emplace(*call.pairs);
     if (call.plan.levels.there()) cycle = std::make_unique<Cycle<Single<T>>>(call.plan.levels);
   }
 };
@@ -66,7 +65,7 @@ class ConjugatePass {
         jacobians_(work.jacobians),
         cycle_(work.cycle.get()),
         f_(work.friction),
-        pairs_(work.pairs.get()),
+        storage_(work.pairs ? &*work.pairs : nullptr),
         team_(team),
         sweep_{plan_, w_, scratch, team} {}
 
@@ -127,10 +126,14 @@ class ConjugatePass {
     }
     sweep_.run(0, Elements{KeepJacobians<T>{jacobians_}, NoStencils{}},
                [](std::int64_t, const Quad<T>&, Sum&) {});
-    if constexpr (HasPairs)
+    if constexpr (HasPairs) {
+      pairs_.reset(new AdjointPairs<T, OneThread>(*call_.pairs, plan_.vertex_order, one_,
+                                                  storage_->memory(environment_), environment_));
       pairs_->read(
-          environment_, [&](int i) -> T& { return w_.inverse[i]; },
-          [&](int i) { return projector(i); }, [&](int i) { return sliding(i); });
+          [&](int i) -> T& { return w_.inverse[i]; }, [&](int i) { return projector(i); },
+          [&](int i) { return sliding(i); },
+          [&](std::int64_t low, std::int64_t square) { return storage_->factors(low, square); });
+    }
   }
 
   void begin(Conjugate& numbers) {
@@ -340,7 +343,7 @@ class ConjugatePass {
   void slant(const Z& z) {
     for (std::int64_t i = 0; i < plan_.vertices; ++i) f_.slanted[i] = z(i);
     pairs_->rows().slant(
-        [&](int i) { return in_double(z(i)); },
+        [&](int i) { return in_double(f_.slanted[i]); },
         [&](int i, const Vec3<double>& a) { f_.slanted[i] = plus(f_.slanted[i], a); });
   }
 
@@ -457,7 +460,9 @@ class ConjugatePass {
   RotationJacobians<T>& jacobians_;
   const Cycle<Lanes>* cycle_;
   FrictionVectors<T>& f_;
-  AdjointPairs<T>* pairs_;
+  PairStorage<T>* storage_;
+  OneThread one_;
+  std::unique_ptr<AdjointPairs<T, OneThread>> pairs_;  // of an environment
   const Team& team_;
   Sweep<Lanes> sweep_;
   std::int64_t environment_ = 0;

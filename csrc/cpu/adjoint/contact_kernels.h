@@ -2,11 +2,12 @@
 // cpu/contact_adjoint_*.cpp, after cpu/target.
 #pragma once
 #include "cpu/adjoint/conjugate_gradients.h"
-#include "cpu/adjoint/pair_gradients.h"
 #include "cpu/step/clean_registers.h"
+#include "solver/adjoint/pair_gradients.h"
 
 #include <algorithm>
 #include <atomic>
+#include <vector>
 
 namespace pd::inline PD_TARGET {
 
@@ -36,8 +37,14 @@ void contact_conjugate_any(const ConjugateCall<T>& call, int threads) {
 template <class T>
 void pair_gradients_any(const PairGradientsCall<T>& call, int threads) {
   each_environment(call.batch, threads, [&](const Team&, const auto& each) {
-    AdjointPairs<T> pairs(call.pairs, call.plan.vertex_order, call.plan.vertices);
-    each([&](std::int64_t e) { differentiate_pairs(call, pairs, e); });
+    PairStorage<T> storage(call.pairs);
+    std::vector<T> inverse(call.vertices);
+    std::vector<Vec3<double>> left(call.vertices);
+    each([&](std::int64_t e) {
+      differentiate_pairs(
+          call, OneThread(), storage.memory(e), inverse.data(), left.data(),
+          [&](std::int64_t low, std::int64_t square) { return storage.factors(low, square); }, e);
+    });
   });
 }
 

@@ -2,6 +2,7 @@
 // environment, with vectors in global memory in plan order, and has barriers between the phases of
 // an iteration. There is no host synchronisation.
 #pragma once
+#include "cuda/adjoint/body_pairs.cuh"
 #include "cuda/adjoint/sums.cuh"
 #include "cuda/common/teams.cuh"
 #include "cuda/multilevel/dense_solve.h"
@@ -18,6 +19,8 @@ struct ConjugateMemory {
   // BiCGStab for friction. smoothed [vertices]: second product of an iteration. Per environment,
   // kept between launches: shadow, the first residual of the cycle; correction, that of y.
   Quad<T>*smoothed, *shadow, *correction;
+  // With pairs [vertices]: the vector that a product is of, slanted, and the product.
+  Quad<T>*slanted, *product;
   // Partial sums. products: d . H d, or two values with friction. squares: |r|^2 and r . r / D, or
   // two values with friction. weighted: r . M r; before that, whether any vertex slides, and the
   // largest component.
@@ -28,7 +31,7 @@ struct ConjugateMemory {
 template <class T>
 struct ConjugateTeams {
   using real = T;
-  static constexpr bool has_stencils = false;
+  static constexpr bool has_stencils = false, has_pairs = false;
   DeviceConjugate<T> call;
   FieldWork<T> product;  // for its weights
   ConjugateMemory<T> memory;
@@ -40,6 +43,9 @@ struct ConjugateTeams {
   PD_HD int parts_of(int vertices) const { return (vertices + threads - 1) / threads; }
   PD_HD int vertex_parts() const { return parts_of(call.plan.vertices); }
   PD_HD int product_parts() const { return call.plan.patches + parts_of(call.plan.shared); }
+  PD_HD int most_parts() const {
+    return vertex_parts() < product_parts() ? product_parts() : vertex_parts();
+  }
 };
 
 // `Work`: ConjugateTeams, or one that adds to it. `WithLevels`: with the multilevel preconditioner. `Computed`: see
@@ -50,12 +56,13 @@ class ConjugateTeam {
   using T = typename Work::real;
 
  private:
+  static constexpr bool has_pairs = Work::has_pairs;
   static_assert(conjugate_threads<T> % (most_parts * warp_size) == 0);
 
  public:
   __device__ ConjugateTeam(const Work& work, const ConjugateMemory<T>& memory,
                            std::int64_t environment, BlockTeam& team, std::byte* shared,
-                           WarpSums& warp_sums, Quad<T>* cycle_sums)
+                           WarpSums& warp_sums, Quad<T>* cycle_sums, const PairPlaces* places)
       : work_(work),
         call_(work.call),
         plan_(work.call.plan),
@@ -67,7 +74,8 @@ class ConjugateTeam {
         slots_(shared, plan_.most_slots),
         entries_(reinterpret_cast<Quad<T>*>(shared + slots_bytes(sizeof(T), plan_.most_slots, 2))),
         warp_sums_(warp_sums),
-        curvature_{memory.products, work.product_parts()},
+        pairs_(work, team, places, environment),
+        curvature_{memory.products, has_pairs ? work.vertex_parts() : work.product_parts()},
         squares_{memory.squares, work.vertex_parts()},
         weighted_{memory.weighted, work.vertex_parts()},
         largest_{memory.weighted, work.vertex_parts()},
@@ -159,18 +167,58 @@ class ConjugateTeam {
           sum[0] = sum[1] = 0;
         });
     team_.barrier();
+    if constexpr (has_pairs) read_pairs();
   }
 
   __device__ void begin(Conjugate& numbers) {
     double sum[2];
     squares_.reduce(sum, warp_sums_);
     if constexpr (WithLevels) sum[1] = apply_levels();
-    numbers.begin(sum[0], sum[1]);
+    if constexpr (has_pairs) {
+      begin_with_pairs(numbers, sum[0]);
+    } else {
+      numbers.begin(sum[0], sum[1]);
+    }
     direction_pending_ = true;
+  }
+
+  // May change 1 / D.
+  __device__ void read_pairs() {
+    const auto sliding = [&](int i) -> const T* {
+      return call_.sliding ? call_.sliding + 3 * slide_count * row(i) : nullptr;
+    };
+    pairs_.all.read([&](int i) -> T& { return m_.residual[i].w; },
+                    [&](int i) { return projector(i); }, sliding,
+                    [&](std::int64_t, std::int64_t) { return pairs_.places.factors; });
+  }
+
+  // `whole`: |b|^2. The pairs may take all of it but rounding: errors are relative to what was there before.
+  __device__ void begin_with_pairs(Conjugate& numbers, double whole) {
+    pairs_.leave(m_.residual);
+    double sum[2] = {0, 0};
+    each_part(
+        0, plan_.vertices,
+        [&](int i) {
+          const Quad<T> residual = m_.residual[i];
+          const double square = wide_dot(vec3(residual), vec3(residual));
+          sum[0] += square;
+          sum[1] += double(residual.w) * square;
+        },
+        [&](int part) {
+          squares_.store(part, sum, warp_sums_);
+          sum[0] = sum[1] = 0;
+        });
+    team_.barrier();
+    squares_.reduce(sum, warp_sums_);
+    numbers.begin(sum[0] + 0 * whole, sum[1]);
+    if (!numbers.active) return;
+    numbers.scale = sqrt(whole);
+    numbers.check_residual(sum[0], call_.tolerance);
   }
 
   __device__ void iterate(Conjugate& numbers) {
     multiply();
+    if constexpr (has_pairs) add_pairs();
     double curvature[1];
     curvature_.reduce(curvature, warp_sums_);
     const T step = T(numbers.step(curvature[0]));
@@ -224,13 +272,28 @@ class ConjugateTeam {
       sum[0] += wide_dot(d, image);
     };
     multiply(next, visit, [&](int part) {
-      curvature_.store(part, sum, warp_sums_);
+      if constexpr (!has_pairs) curvature_.store(part, sum, warp_sums_);
       sum[0] = 0;
     });
     Quad<T>* const last = last_;
     last_ = next_;
     next_ = last;
     direction_pending_ = false;
+  }
+
+  // Completes the product with the last direction, and the curvature along it.
+  __device__ void add_pairs() {
+    pairs_.multiply(
+        true, [&](int i) { return vec3(last_[i]); }, [&](int i) { return projector(i); }, m_.image);
+    pairs_.leave(m_.image);
+    double sum[1] = {0};
+    each_part(
+        0, plan_.vertices, [&](int i) { sum[0] += wide_dot(vec3(last_[i]), vec3(m_.image[i])); },
+        [&](int part) {
+          curvature_.store(part, sum, warp_sums_);
+          sum[0] = 0;
+        });
+    team_.barrier();
   }
 
   // Computes the elastic product with a field what(vertex). Calls visit(vertex, product, field) for
@@ -331,6 +394,7 @@ class ConjugateTeam {
   Slots<T> slots_;
   Quad<T>* entries_;
   WarpSums& warp_sums_;
+  BodyPairs<Work> pairs_;
   PartialSums<Add, 1> curvature_;
   PartialSums<Add, 2> squares_;
   PartialSums<Add, 1> weighted_;

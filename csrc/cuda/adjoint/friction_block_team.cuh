@@ -15,6 +15,7 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
   using Base::environment_;
   using Base::last_;
   using Base::m_;
+  using Base::pairs_;
   using Base::plan_;
   using Base::projector;
   using Base::row;
@@ -23,6 +24,7 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
   using Base::unit_;
   using Base::warp_sums_;
   using typename Base::T;
+  static constexpr bool has_pairs = Work::has_pairs;
 
  public:
   using Base::Base;
@@ -34,8 +36,9 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
     FrictionSolve friction(of_friction, numbers.scale);
     // the same decision in all threads of the team
     if (!numbers.active && !friction.active()) return;
-    const bool slides = any_slides();
+    bool slides = any_slides();
     Base::load(numbers.begins);
+    if constexpr (has_pairs) slides = slides || pairs_.all.some();
     if (friction.active()) {
       scale_cycle(T(1) / unit_);
       team_.barrier();
@@ -71,7 +74,26 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
 
   __device__ const T* sliding(int i) const { return call_.sliding + 3 * slide_count * row(i); }
 
+  // Only scenes with pairs have friction without vertices that touch planes or spheres.
+  __device__ Vec3<T> press(const Vec3<T>& z, int i) const {
+    if constexpr (has_pairs) {
+      if (!call_.sliding) return z;
+    }
+    return transposed_friction(z, sliding(i));
+  }
+  __device__ Vec3<T> image_of(const Vec3<T>& elastic, const Vec3<T>& z, int i) const {
+    const bool moves = m_.residual[i].w != T(0);
+    if constexpr (has_pairs) {
+      if (!call_.sliding)
+        return conjugate_image<T>(elastic, z, last_[i].w, moves, projector(i), nullptr);
+    }
+    return friction_image(elastic, z, last_[i].w, moves, projector(i), sliding(i));
+  }
+
   __device__ bool any_slides() {
+    if constexpr (has_pairs) {
+      if (!call_.sliding) return false;
+    }
     double any[1] = {0};
     each_part(
         0, plan_.vertices, [&](int i) { any[0] = slides(sliding(i)) ? 1 : any[0]; },
@@ -95,9 +117,8 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
 
   // Replaces the solution y by the multiplier G^T y.
   __device__ void press_solution() {
-    each_vertex([&](int i) {
-      m_.solution[i] = quad(transposed_friction(vec3(m_.solution[i]), sliding(i)));
-    });
+    if constexpr (has_pairs) pairs_.slant(m_.solution);
+    each_vertex([&](int i) { m_.solution[i] = quad(press(vec3(m_.solution[i]), i)); });
   }
 
   // Called after the solve of the symmetric part.
@@ -117,32 +138,66 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
     return residual.w * vec3(stage == FrictionStage::first ? last_[i] : residual);
   }
 
-  // Computes A z and its dot products.
+  // What a product is of: z, slanted if there are pairs.
+  __device__ Vec3<T> moved(FrictionStage stage, int i) const {
+    if constexpr (has_pairs) return vec3(m_.slanted[i]);
+    return z(stage, i);
+  }
+
+  // Keeps A z at a vertex, and adds to its dot products.
+  __device__ void record(FrictionStage stage, int i, const Vec3<T>& image, double (&sum)[2]) {
+    const Quad<T> residual = m_.residual[i];
+    if (stage == FrictionStage::residual) {
+      m_.residual[i] = quad(image, residual.w);
+      sum[0] += wide_dot(image, image);
+    } else if (stage == FrictionStage::first) {
+      m_.image[i] = quad(image);
+      sum[0] += wide_dot(vec3(m_.shadow[i]), image);
+    } else {
+      m_.smoothed[i] = quad(image);
+      sum[0] += wide_dot(image, vec3(residual));
+      sum[1] += wide_dot(image, image);
+    }
+  }
+
+  // Computes A z, or what it leaves of the right side, and its dot products.
   __device__ void multiply(FrictionStage stage) {
     const T per_unit = T(1) / unit_;
-    double sum[2] = {0, 0};
-    const auto pressed = [&](int i) { return transposed_friction(z(stage, i), sliding(i)); };
-    const auto visit = [&](int i, const Vec3<T>& elastic, const Vec3<T>&) {
-      const Quad<T> residual = m_.residual[i];
-      const Vec3<T> image = friction_image(elastic, z(stage, i), last_[i].w, residual.w != T(0),
-                                           projector(i), sliding(i));
-      if (stage == FrictionStage::residual) {
-        const Vec3<T> rest = per_unit * read3(call_.right + 3 * row(i)) - image;
-        m_.residual[i] = quad(rest, residual.w);
-        sum[0] += wide_dot(rest, rest);
-      } else if (stage == FrictionStage::first) {
-        m_.image[i] = quad(image);
-        sum[0] += wide_dot(vec3(m_.shadow[i]), image);
-      } else {
-        m_.smoothed[i] = quad(image);
-        sum[0] += wide_dot(image, vec3(residual));
-        sum[1] += wide_dot(image, image);
-      }
+    const auto left = [&](int i, const Vec3<T>& image) {
+      return stage == FrictionStage::residual ? per_unit * read3(call_.right + 3 * row(i)) - image
+                                              : image;
     };
-    Base::multiply(pressed, visit, [&](int part) {
+    double sum[2] = {0, 0};
+    const auto store = [&](int part) {
       products_.store(part, sum, warp_sums_);
       sum[0] = sum[1] = 0;
-    });
+    };
+    const auto pressed = [&](int i) { return press(moved(stage, i), i); };
+    if constexpr (has_pairs) {
+      each_vertex([&](int i) { m_.slanted[i] = quad(z(stage, i)); });
+      team_.barrier();
+      pairs_.slant(m_.slanted);
+      Base::multiply(
+          pressed,
+          [&](int i, const Vec3<T>& elastic, const Vec3<T>&) {
+            m_.product[i] = quad(image_of(elastic, moved(stage, i), i));
+          },
+          [](int) {});
+      pairs_.multiply(false, pressed, [&](int i) { return projector(i); }, m_.product);
+      each_vertex([&](int i) { m_.product[i] = quad(left(i, vec3(m_.product[i]))); });
+      team_.barrier();
+      pairs_.leave(m_.product);
+      each_part(
+          0, plan_.vertices, [&](int i) { record(stage, i, vec3(m_.product[i]), sum); }, store);
+      team_.barrier();
+    } else {
+      Base::multiply(
+          pressed,
+          [&](int i, const Vec3<T>& elastic, const Vec3<T>&) {
+            record(stage, i, left(i, image_of(elastic, moved(stage, i), i)), sum);
+          },
+          store);
+    }
   }
 
   __device__ void advance(FrictionSolve& friction) {

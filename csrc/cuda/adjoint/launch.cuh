@@ -14,8 +14,12 @@ __device__ ConjugateMemory<T> memory_of_team(const ConjugateTeams<T>& work, int 
   for (Quad<T>** array : {&m.x, &m.solution, &m.image, &m.residual, &m.direction, &m.other})
     *array += vertices;
   if (work.call.friction) m.smoothed += vertices;
+  if (work.call.pairs) {
+    m.slanted += vertices;
+    m.product += vertices;
+  }
   m.shared_force += std::int64_t(work.call.plan.slots) * team;
-  m.products += 2 * std::int64_t(work.product_parts()) * team;
+  m.products += 2 * std::int64_t(work.most_parts()) * team;
   m.squares += 2 * std::int64_t(work.vertex_parts()) * team;
   m.weighted += std::int64_t(work.vertex_parts()) * team;
   if (work.call.plan.levels.there()) m.cycle = cycle_of_team(work.call.plan.levels, m.cycle, team);
@@ -35,13 +39,23 @@ __global__ void __launch_bounds__(conjugate_threads<typename Work::real>)
   using Team = std::conditional_t<WithFriction, FrictionTeam<Work, WithLevels, Computed>,
                                   ConjugateTeam<Work, WithLevels, Computed>>;
   const ConjugateMemory<T> of_team = memory_of_team(work, number);
+  const PairPlaces* places = nullptr;
+  if constexpr (Work::has_pairs) {
+    __shared__ PairPlaces of_pairs;
+    if (threadIdx.x == 0) {
+      Arena arena(work.arena.memory + work.arena.stride * number);
+      PairArena::arrange(arena, work.pairs, of_pairs.memory, of_pairs.factors);
+    }
+    __syncthreads();
+    places = &of_pairs;
+  }
   for (std::int64_t e = number; e < work.call.batch; e += work.teams) {
     ConjugateMemory<T> memory = of_team;
     if constexpr (WithFriction) {
       memory.shadow += work.call.plan.vertices * e;
       memory.correction += work.call.plan.vertices * e;
     }
-    Team(work, memory, e, team, shared, warp_sums, cycle_sums).run();
+    Team(work, memory, e, team, shared, warp_sums, cycle_sums, places).run();
   }
 }
 
@@ -64,12 +78,14 @@ struct ConjugateLaunch {
                         call.friction ? kernel_for<true>(call.plan) : kernel_for<false>(call.plan),
                         call.plan.most_pairs) {}
 
-  // `pairs`: of tetrahedra, or items that threads take like them
-  ConjugateLaunch(const DeviceConjugate<T>& call, const void* function, int pairs)
+  // `pairs`: of tetrahedra, or items that threads take like them; `most`: teams
+  ConjugateLaunch(const DeviceConjugate<T>& call, const void* function, int pairs,
+                  std::int64_t most = most_vertices)
       : kernel(function),
         threads(threads_of(call.plan, pairs)),
         shared(pass_shared_bytes(sizeof(T), call.plan.most_slots, call.plan.most_entries, 2)),
-        teams(std::min(call.batch, std::max<std::int64_t>(1, most_vertices / call.plan.vertices)),
+        teams(std::min({call.batch, most,
+                        std::max<std::int64_t>(1, most_vertices / call.plan.vertices)}),
               resident(), useful(call.plan)) {}
 
   static int most_iterations(const DeviceConjugate<T>& call) {
@@ -124,7 +140,10 @@ ConjugateTeams<T> arrange_teams(Arena& arena, const DeviceConjugate<T>& call,
     for (Quad<T>** array : {&m.shadow, &m.correction})
       arena.place(*array, call.batch * call.plan.vertices);
   }
-  arena.place(m.products, 2 * count * work.product_parts());
+  if (call.pairs) {
+    for (Quad<T>** array : {&m.slanted, &m.product}) arena.place(*array, vertices);
+  }
+  arena.place(m.products, 2 * count * work.most_parts());
   arena.place(m.squares, 2 * count * work.vertex_parts());
   arena.place(m.weighted, count * work.vertex_parts());
   if (call.plan.levels.there()) arrange(arena, call.plan.levels, teams.count, m.cycle);

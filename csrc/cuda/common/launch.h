@@ -2,6 +2,7 @@
 // enqueue work on a stream and return.
 #pragma once
 #include "math/config.h"
+#include "solver/adjoint/pair_views.h"
 #include "views/vertex_sum.h"
 #include "views/views.h"
 
@@ -128,6 +129,21 @@ template <class T>
 std::int64_t mixed_conjugate_bytes(const MixedConjugate<T>& call);
 template <class T>
 void run_mixed_conjugate(const MixedConjugate<T>& call, void* memory, Stream stream);
+
+// The same with contact between bodies, of a plan for kernel `stream`.
+template <class T>
+std::int64_t contact_conjugate_bytes(const MixedConjugate<T>& call);
+template <class T>
+void run_contact_conjugate(const MixedConjugate<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t pair_gradients_bytes(const PairGradientsCall<T>& call);
+template <class T>
+void run_pair_gradients(const PairGradientsCall<T>& call, void* memory, Stream stream);
+
+// Memory for the pairs of all environments in progress, and at most that of one.
+constexpr std::int64_t most_pair_bytes = std::int64_t(1) << 32;
+template <class T>
+std::int64_t bytes_of_pairs(const LoadedPairs<T>& pairs);
 
 template <class T>
 void run_adjoint_system(const DeviceAdjointSystem<T>& call, Stream stream);

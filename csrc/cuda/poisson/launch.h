@@ -59,5 +59,9 @@ template <class T>
 std::int64_t mixed_conjugate_bytes(const MixedConjugate<T>& call);
 template <class T>
 void run_mixed_conjugate(const MixedConjugate<T>& call, void* memory, Stream stream);
+template <class T>
+std::int64_t contact_conjugate_bytes(const MixedConjugate<T>& call);
+template <class T>
+void run_contact_conjugate(const MixedConjugate<T>& call, void* memory, Stream stream);
 
 }  // namespace pd::poisson

@@ -142,7 +142,7 @@ class Step:
 
 
 def seeded(like: Tensor, seed: int) -> Tensor:
-    return torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(like.dtype)
+    return torch.randn(like.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(like)
 
 
 def pairs_of(plan: Any, keys: Tensor) -> Pairs:

@@ -1,4 +1,4 @@
-// What the adjoint of a step reads of the pairs with forces at its end.
+// What the adjoint of a step reads of the pairs with forces at its end, and what it writes.
 #pragma once
 #include "contact/views.h"
 #include "views/views.h"
@@ -15,6 +15,7 @@ struct LoadedPairs {
   const T *poses_before, *poses_after;  // [colliders, 7]
   const std::int64_t* keys;             // [capacity], -1 pads at the end
   const T* forces;                      // [capacity, 4]
+  std::int64_t most = 0;                // loaded pairs of any environment, or more
 };
 
 // Derivatives of a loss by what the pairs of a solved adjoint depend on.
@@ -29,7 +30,9 @@ struct PairGradients {
 // A solved adjoint, as in a ConjugateCall; [batch, vertices, 3] each.
 template <class T>
 struct PairGradientsCall {
-  Plan<T> plan;
+  using real = T;
+  const int* vertex_order;  // of a plan
+  int vertices = 0;
   LoadedPairs<T> pairs;
   Values<T> inertia, inverse;  // [vertices]
   std::int64_t batch = 0;

@@ -1,0 +1,85 @@
+// The team of solver/adjoint's pairs on one thread. cuda/adjoint/pair_team.cuh has that of blocks.
+//
+// A team splits loops and waits after each. Its sums do not depend on the number of its threads.
+#pragma once
+#include "math/device.h"
+
+#include <cstdint>
+#include <type_traits>
+
+namespace pd::inline PD_TARGET {
+
+// The largest of some numbers, and the first that has it.
+struct Largest {
+  double value;
+  int index;
+};
+
+class OneThread {
+ public:
+  template <class Item>
+  void each(std::int64_t count, const Item& item) const {
+    for (std::int64_t i = 0; i < count; ++i) item(int(i));
+  }
+  // item(first, width): some numbers from `first` on, as many as are good to take together
+  template <class Item>
+  void strips(int count, const Item& item) const {
+    constexpr int width = 8;
+    int i = 0;
+    for (; i + width <= count; i += width) item(i, std::integral_constant<int, width>());
+    for (; i < count; ++i) item(i, std::integral_constant<int, 1>());
+  }
+  template <class Item>
+  void grid(int rows, int columns, const Item& item) const {
+    for (int i = 0; i < rows; ++i)
+      for (int j = 0; j < columns; ++j) item(i, j);
+  }
+  // take(n, sum of term(n, p) over p below length(n))
+  template <class Length, class Term, class Take>
+  void dots(std::int64_t count, const Length& length, const Term& term, const Take& take) const {
+    constexpr int width = 8;
+    for (int n = 0; n < int(count); ++n) {
+      double sums[width] = {}, sum = 0;
+      const int terms = length(n);
+      int p = 0;
+      for (; p + width <= terms; p += width)
+        for (int u = 0; u < width; ++u) sums[u] += term(n, p + u);
+      for (; p < terms; ++p) sum += term(n, p);
+      for (double part : sums) sum += part;
+      take(n, sum);
+    }
+  }
+  // of value(i), or {least, -1} if none is larger
+  template <class Value>
+  Largest largest(int count, double least, const Value& value) const {
+    Largest found{least, -1};
+    for (int i = 0; i < count; ++i) {
+      const double own = value(i);
+      if (own > found.value) found = {own, i};
+    }
+    return found;
+  }
+  // Replaces numbers [count] by the sums of those before; [count] is the sum of all.
+  void scan(int* numbers, std::int64_t count) const {
+    int sum = 0;
+    for (std::int64_t i = 0; i < count; ++i) {
+      const int own = numbers[i];
+      numbers[i] = sum;
+      sum += own;
+    }
+    numbers[count] = sum;
+  }
+  template <class Task>
+  void once(const Task& task) const {
+    task();
+  }
+  void barrier() const {}
+  // Adds to a number that other threads may add to; returns what it was.
+  int add(int* to, int more) const {
+    const int was = *to;
+    *to += more;
+    return was;
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

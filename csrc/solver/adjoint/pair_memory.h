@@ -1,0 +1,112 @@
+// Arrays of the loaded pairs of one environment in the adjoint of its step.
+#pragma once
+#include "contact/pairs/curvature.h"
+
+#include <cstdint>
+
+namespace pd::inline PD_TARGET {
+
+// A pair, its multipliers and the derivatives by its corners at the end.
+//
+// Nodes are the vertices of bodies by the internal numbers of a plan, then those of colliders.
+struct PairItem {
+  int vertex[4], node[4];
+  int moves[4];  // its node, -1 where it does not move
+  LoadedPair<double> pair;
+  PairSlopes<double> slopes;
+  double step;  // of its multipliers in a sweep
+  int first_row;
+  int bodies;  // place in the table of friction
+  bool has_scene_thickness;
+};
+
+// C and B of one row, at the corners that move.
+struct PairRow {
+  Vec3<double> held[4], pushed[4];
+  int item;
+  int pivot;  // its number among the independent rows, or -1
+};
+
+// Rows that share no vertex with others, directly or through others.
+struct PairPatch {
+  int begin, end;  // rows
+  int first_pivot, rank;
+  std::int64_t low, square;  // places in PairFactors
+};
+
+struct PairCounts {
+  int pairs, rows, patches, pivots;
+  int changed;               // labels
+  int skewed;                // rows whose B differs from C
+  std::int64_t low, square;  // numbers of the factors, at most
+};
+
+// Of one environment, at most.
+struct PairSizes {
+  std::int64_t nodes = 0, vertices = 0;  // of both kinds, and of bodies
+  std::int64_t keys = 0;                 // of the history
+  std::int64_t pairs = 0;                // loaded ones
+  std::int64_t bodies = 0;
+
+  PD_HD std::int64_t rows() const { return 3 * pairs; }
+  PD_HD std::int64_t columns() const { return rows() < 3 * vertices ? rows() : 3 * vertices; }
+};
+
+struct PairMemory {
+  PairItem* item;
+  PairRow* row;
+  PairPatch* patch;
+  int* slot;                  // [keys + 1] items before each key
+  int* internal;              // [vertices] internal numbers of the user's
+  int *start, *entry;         // of the nodes: 4 item + corner
+  int *least, *cursor;        // [nodes]
+  int *label, *other, *size;  // [pairs]
+  int *pivot, *of_patch;      // [columns] rows, and patches
+  int* order;                 // [columns]
+  PairCounts* counts;
+  double* inverse;                                // [vertices] 1 / D
+  double* spread;                                 // [nodes]
+  Vec3<double>* field;                            // [nodes]
+  Vec3<double>*part, *part_of_start;              // [4 pairs]
+  double *whole, *left, *column, *along, *found;  // [rows]
+  double *sums, *turned;                          // [columns]
+  double* friction;                               // [bodies, bodies]
+
+  template <class Arena>
+  PD_HD void arrange(Arena& arena, const PairSizes& s) {
+    arena.place(item, s.pairs);
+    arena.place(row, s.rows());
+    arena.place(patch, s.pairs);
+    arena.place(slot, s.keys + 1);
+    arena.place(internal, s.vertices);
+    arena.place(start, s.nodes + 1);
+    arena.place(entry, 4 * s.pairs);
+    for (int** array : {&least, &cursor}) arena.place(*array, s.nodes);
+    for (int** array : {&label, &other, &size}) arena.place(*array, s.pairs);
+    for (int** array : {&pivot, &of_patch, &order}) arena.place(*array, s.columns());
+    arena.place(counts, 1);
+    arena.place(inverse, s.vertices);
+    arena.place(spread, s.nodes);
+    arena.place(field, s.nodes);
+    for (Vec3<double>** array : {&part, &part_of_start}) arena.place(*array, 4 * s.pairs);
+    for (double** array : {&whole, &left, &column, &along, &found}) arena.place(*array, s.rows());
+    for (double** array : {&sums, &turned}) arena.place(*array, s.columns());
+    arena.place(friction, s.bodies * s.bodies);
+  }
+};
+
+// Factors of all patches: L by columns [rank, rows], and per patch [rank, rank] of both squares.
+struct PairFactors {
+  double* low;
+  double* inverse_lower;  // of L_r: below the diagonal, and mirrored above
+  double* mixed;          // the inverse of L^T B^T D^-1 C_r^T
+
+  template <class Arena>
+  PD_HD void arrange(Arena& arena, std::int64_t low_count, std::int64_t square_count) {
+    arena.place(low, low_count);
+    arena.place(inverse_lower, square_count);
+    arena.place(mixed, square_count);
+  }
+};
+
+}  // namespace pd::inline PD_TARGET

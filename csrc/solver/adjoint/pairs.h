@@ -1,0 +1,440 @@
+// The loaded pairs of one environment in the adjoint of its step: see contact/pairs/curvature.h for
+// one pair, and solver/adjoint/pair_rows.h for the directions that they leave.
+//
+// A projector and the vectors of sliding of a vertex that touches planes or spheres of the scene
+// restrict its rows.
+#pragma once
+#include "math/screw.h"
+#include "solver/adjoint/friction.h"
+#include "solver/adjoint/one_thread.h"
+#include "solver/adjoint/pair_rows.h"
+#include "solver/adjoint/pair_views.h"
+
+namespace pd::inline PD_TARGET {
+
+template <class T>
+PD_HD PairSizes pair_sizes(const LoadedPairs<T>& call) {
+  const ContactPlan<T>& plan = call.plan;
+  return {plan.vertices, plan.body_vertices, plan.capacity, call.most, plan.bodies};
+}
+
+// `Team`: as OneThread
+template <class T, class Team>
+class AdjointPairs {
+ public:
+  using Place = Vec3<double>;
+
+  // `vertex_order`: the user's numbers of the vertices of bodies
+  PD_HD AdjointPairs(const LoadedPairs<T>& call, const int* vertex_order, const Team& team,
+                     const PairMemory& memory, std::int64_t environment)
+      : call_(call),
+        plan_(call.plan),
+        order_(vertex_order),
+        team_(team),
+        m_(memory),
+        environment_(environment),
+        count_(call.plan.body_vertices),
+        rows_(team, memory, call.plan.body_vertices) {}
+
+  // Reads the pairs. `inverse(i)`: a reference to 1 / D of a vertex, to whose D sliding pairs add.
+  // `projector(i)`, `sliding(i)`: as in a ConjugateCall, or null. `provide(low, square)`: memory for
+  // factors of such sizes.
+  template <class Inverse, class Projector, class Sliding, class Provide>
+  PD_CALLED void read(const Inverse& inverse, const Projector& projector, const Sliding& sliding,
+                      const Provide& provide) {
+    find(inverse);
+    index();
+    weigh(inverse);
+    find_patches();
+    team_.each(m_.counts->pairs, [&](int n) {
+      for (int k = 0; k < m_.item[n].pair.rows(); ++k) write_row(n, k, projector, sliding);
+    });
+    rows_.factor(provide(m_.counts->low, m_.counts->square), repeated_row<T>,
+                 m_.counts->skewed > 0);
+  }
+
+  PD_HD PairRows<Team>& rows() { return rows_; }
+  PD_HD const PairRows<Team>& rows() const { return rows_; }
+  PD_HD bool some() const { return m_.counts->pairs > 0; }
+
+  // Visits visit(i, K^T l) for every vertex that moves; `read(i)`: l there. `positive`: the positive
+  // part alone, the turn of slips. Curvature of distances is negative where corners meet.
+  template <class Read, class Visit>
+  PD_HD void multiply(bool positive, const Read& read, const Visit& visit) const {
+    team_.each(4 * std::int64_t(m_.counts->pairs), [&](int n) {
+      const PairItem& item = m_.item[n / 4];
+      const auto& weight = item.pair.frame.weight;
+      const int a = n % 4;
+      m_.part[n] = {0, 0, 0};
+      if (item.moves[a] < 0) return;
+      double l[12];
+      gather(item, read, l);
+      if (positive) {
+        double turned = 0;
+        for (int b = 0; b < 4; ++b)
+          turned +=
+              weight[b] * dot(item.slopes.across, Place{l[3 * b], l[3 * b + 1], l[3 * b + 2]});
+        m_.part[n] = (item.slopes.stiffness * weight[a] * turned) * item.slopes.across;
+        return;
+      }
+      double product[3] = {0, 0, 0};
+      for (int i = 0; i < 12; ++i)
+        for (int j = 0; j < 3; ++j) product[j] += item.slopes.load[i][3 * a + j] * l[i];
+      m_.part[n] = {product[0], product[1], product[2]};
+    });
+    team_.each(count_, [&](int v) {
+      if (m_.start[v] < m_.start[v + 1] && m_.inverse[v] > 0) visit(v, sum_of(v, m_.part));
+    });
+  }
+
+  // The derivatives that remain, from the multiplier l of the step and nu of the rows.
+  template <class Read>
+  PD_CALLED void differentiate(const Read& read, double* nu, const PairGradients<T>& out) const {
+    const int pairs = m_.counts->pairs;
+    // in newtons and so on, from those of scaled rows
+    team_.each(m_.counts->rows, [&](int p) { nu[p] *= sqrt(m_.item[m_.row[p].item].step); });
+    team_.each(4 * std::int64_t(pairs), [&](int n) {
+      const PairItem& item = m_.item[n / 4];
+      double l[12], end[3], start[3];
+      gather(item, read, l);
+      Place after[4], before[4];
+      corners(item, after, before);
+      for (int i = 0; i < 3; ++i) {
+        const int j = 3 * (n % 4) + i;
+        const PairSlope<double> slope(item.pair, after, before, false, j);
+        end[i] = start[i] = 0;
+        for (int c = 0; c < 12; ++c) {
+          end[i] += item.slopes.load[c][j] * l[c];
+          start[i] += slope.load[c] * l[c];
+        }
+        for (int k = 0; k < item.pair.rows(); ++k) {
+          end[i] += item.slopes.row[k][j] * nu[item.first_row + k];
+          start[i] += slope.row[k] * nu[item.first_row + k];
+        }
+      }
+      m_.part[n] = {end[0], end[1], end[2]};
+      m_.part_of_start[n] = {start[0], start[1], start[2]};
+    });
+    to_places(m_.part, call_.poses_after, out.end, out.poses_end);
+    to_places(m_.part_of_start, call_.poses_before, out.start, out.poses_start);
+    to_friction(read, out.friction + environment_ * plan_.bodies * plan_.bodies);
+    team_.dots(
+        1, [&](int) { return pairs; },
+        [&](int, int n) {
+          const PairItem& item = m_.item[n];
+          return item.has_scene_thickness ? nu[item.first_row] : 0.0;
+        },
+        [&](int, double sum) { out.thickness[environment_] = T(sum); });
+  }
+
+ private:
+  // ---- the pairs
+
+  PD_HD static Place at(const T* p) { return {double(p[0]), double(p[1]), double(p[2])}; }
+
+  // of any vertex, by the places of bodies and the poses of colliders
+  PD_HD Place place(int v, const T* bodies, const T* poses) const {
+    if (v < count_) return at(bodies + 3 * (environment_ * count_ + v));
+    const T* const pose = poses + 7 * (environment_ * plan_.colliders + plan_.collider[v]);
+    return Pose<double>{at(pose), double(pose[3]), at(pose + 4)}.place(
+        at(plan_.local + 3 * std::int64_t(v - count_)));
+  }
+
+  PD_HD void corners(const PairItem& item, Place (&after)[4], Place (&before)[4]) const {
+    for (int a = 0; a < 4; ++a) {
+      after[a] = place(item.vertex[a], call_.after, call_.poses_after);
+      before[a] = place(item.vertex[a], call_.before, call_.poses_before);
+    }
+  }
+
+  template <class Read>
+  PD_HD void gather(const PairItem& item, const Read& read, double (&l)[12]) const {
+    for (int a = 0; a < 4; ++a) {
+      const Place of = item.node[a] < count_ ? read(item.node[a]) : Place{0, 0, 0};
+      l[3 * a] = of.x, l[3 * a + 1] = of.y, l[3 * a + 2] = of.z;
+    }
+  }
+
+  PD_HD Place sum_of(int node, const Vec3<double>* part) const {
+    Place sum = {0, 0, 0};
+    for (int n = m_.start[node]; n < m_.start[node + 1]; ++n) sum = sum + part[m_.entry[n]];
+    return sum;
+  }
+
+  // Fills the items, in the order of the keys.
+  template <class Inverse>
+  PD_HD void find(const Inverse& inverse) {
+    team_.each(plan_.capacity, [&](int n) {
+      const std::int64_t row = environment_ * plan_.capacity + n;
+      m_.slot[n] = call_.keys[row] >= 0 && call_.forces[4 * row] > T(0);
+    });
+    team_.each(count_, [&](int i) { m_.internal[order_[i]] = i; });
+    team_.scan(m_.slot, plan_.capacity);
+    team_.once([&] { m_.counts->pairs = m_.slot[plan_.capacity]; });
+    team_.each(plan_.capacity, [&](int n) {
+      if (m_.slot[n + 1] > m_.slot[n]) set(m_.item[m_.slot[n]], n, inverse);
+    });
+    team_.each(12 * std::int64_t(m_.counts->pairs), [&](int n) {
+      PairItem& item = m_.item[n / 12];
+      Place after[4], before[4];
+      corners(item, after, before);
+      item.slopes.differentiate(item.pair, after, before, n % 12);
+    });
+  }
+
+  template <class Inverse>
+  PD_HD void set(PairItem& item, int number, const Inverse& inverse) const {
+    const std::int64_t row = environment_ * plan_.capacity + number, key = call_.keys[row],
+                       first_edge = std::int64_t(plan_.vertices) * plan_.triangles;
+    const T* f = call_.forces + 4 * row;
+    const bool edges = key >= first_edge;
+    if (edges) {
+      const std::int64_t pair = key - first_edge;
+      for (int a = 0; a < 2; ++a) {
+        item.vertex[a] = plan_.edge[2 * (pair / plan_.edges) + a];
+        item.vertex[2 + a] = plan_.edge[2 * (pair % plan_.edges) + a];
+      }
+    } else {
+      item.vertex[0] = int(key / plan_.triangles);
+      for (int a = 0; a < 3; ++a)
+        item.vertex[1 + a] = plan_.triangle[3 * (key % plan_.triangles) + a];
+    }
+    double weights[4];
+    for (int a = 0; a < 4; ++a) {
+      const int v = item.vertex[a];
+      item.node[a] = v < count_ ? m_.internal[v] : v;
+      weights[a] = v < count_ ? double(inverse(item.node[a])) : 0.0;
+      item.moves[a] = weights[a] > 0 ? item.node[a] : -1;
+    }
+    const int first = plan_.body[item.vertex[0]], last = plan_.body[item.vertex[3]];
+    item.bodies = first * plan_.bodies + last;
+    item.has_scene_thickness = first != last || !is_close_at_rest(key);
+    Place after[4], before[4];
+    corners(item, after, before);
+    item.pair = loaded_pair(edges, after, before, weights, double(plan_.friction[item.bodies]),
+                            double(f[0]), Place{double(f[1]), double(f[2]), double(f[3])});
+    item.slopes.set(item.pair, after, before);
+  }
+
+  PD_HD bool is_close_at_rest(std::int64_t key) const {
+    std::int64_t begin = 0, end = plan_.rest_pairs;
+    while (begin < end) {
+      const std::int64_t middle = (begin + end) / 2;
+      (plan_.rest_key[middle] < key ? begin : end) =
+          plan_.rest_key[middle] < key ? middle + 1 : middle;
+    }
+    return begin < plan_.rest_pairs && plan_.rest_key[begin] == key;
+  }
+
+  // Corners of every node, in the order of the items.
+  PD_HD void index() {
+    const int corners_count = 4 * m_.counts->pairs;
+    team_.each(plan_.vertices, [&](int v) { m_.start[v] = 0; });
+    team_.each(corners_count, [&](int n) { team_.add(m_.start + m_.item[n / 4].node[n % 4], 1); });
+    team_.scan(m_.start, plan_.vertices);
+    team_.each(plan_.vertices, [&](int v) { m_.cursor[v] = m_.start[v]; });
+    team_.each(corners_count,
+               [&](int n) { m_.entry[team_.add(m_.cursor + m_.item[n / 4].node[n % 4], 1)] = n; });
+    // they came in the order of threads
+    team_.each(plan_.vertices, [&](int v) {
+      for (int n = m_.start[v] + 1; n < m_.start[v + 1]; ++n) {
+        const int own = m_.entry[n];
+        int to = n;
+        for (; to > m_.start[v] && m_.entry[to - 1] > own; --to) m_.entry[to] = m_.entry[to - 1];
+        m_.entry[to] = own;
+      }
+    });
+  }
+
+  // Steps of the pairs; adds to D the stiffness by which the slips turn.
+  template <class Inverse>
+  PD_HD void weigh(const Inverse& inverse) {
+    team_.each(count_, [&](int v) {
+      m_.spread[v] = 0;
+      for (int n = m_.start[v]; n < m_.start[v + 1]; ++n)
+        m_.spread[v] += absolute(m_.item[m_.entry[n] / 4].pair.frame.weight[m_.entry[n] % 4]);
+    });
+    team_.each(m_.counts->pairs, [&](int n) {
+      PairItem& item = m_.item[n];
+      double yielding = 0;
+      for (int a = 0; a < 4; ++a) {
+        const int v = item.node[a];
+        if (v < count_)
+          yielding += absolute(item.pair.frame.weight[a]) * m_.spread[v] * double(inverse(v));
+      }
+      item.step = yielding > 0 ? 1 / yielding : 0.0;
+    });
+    team_.each(count_, [&](int v) {
+      double more = 0;
+      for (int n = m_.start[v]; n < m_.start[v + 1]; ++n) {
+        const PairItem& item = m_.item[m_.entry[n] / 4];
+        const double weight = item.pair.frame.weight[m_.entry[n] % 4];
+        more += item.slopes.stiffness * weight * weight;
+      }
+      T& own = inverse(v);
+      if (more > 0 && own > T(0)) own = T(1 / (1 / double(own) + more));
+      m_.inverse[v] = double(own);
+    });
+  }
+
+  // Numbers the rows patch by patch. A label is the first item of a patch; every round passes labels
+  // on through the vertices, and each takes that of the item that its label names.
+  PD_HD void find_patches() {
+    const int pairs = m_.counts->pairs;
+    team_.each(pairs, [&](int n) { m_.label[n] = n; });
+    for (;;) {
+      team_.once([&] { m_.counts->changed = 0; });
+      team_.each(count_, [&](int v) {
+        int least = pairs;
+        if (m_.inverse[v] > 0) {
+          for (int n = m_.start[v]; n < m_.start[v + 1]; ++n)
+            least = min_of(least, m_.label[m_.entry[n] / 4]);
+        }
+        m_.least[v] = least;
+      });
+      team_.each(pairs, [&](int n) {
+        int least = m_.label[n];
+        for (int v : m_.item[n].moves) least = v < 0 ? least : min_of(least, m_.least[v]);
+        m_.other[n] = least;
+      });
+      team_.each(pairs, [&](int n) {
+        const int to = m_.other[m_.other[n]];
+        if (to != m_.label[n]) team_.add(&m_.counts->changed, 1);
+        m_.label[n] = to;
+      });
+      const bool changed = m_.counts->changed > 0;
+      team_.barrier();
+      if (!changed) break;
+    }
+    team_.each(pairs, [&](int n) { m_.size[n] = m_.other[n] = 0; });
+    team_.each(count_, [&](int v) {
+      if (m_.least[v] < pairs) team_.add(m_.other + m_.least[v], 1);
+    });
+    team_.each(pairs, [&](int n) { team_.add(m_.size + m_.label[n], m_.item[n].pair.rows()); });
+    team_.once([&] { number_rows(); });
+  }
+
+  // `size`, `other`: rows and vertices of the patch that an item names
+  PD_HD void number_rows() {
+    int rows = 0, patches = 0;
+    std::int64_t low = 0, square = 0;
+    const int pairs = m_.counts->pairs;
+    for (int n = 0; n < pairs; ++n) {
+      if (m_.label[n] == n) {
+        const std::int64_t own = m_.size[n], rank = min_of(own, 3 * std::int64_t(m_.other[n]));
+        m_.patch[patches++] = {rows, rows + int(own), 0, 0, 0, 0};
+        m_.size[n] = rows;
+        rows += int(own);
+        low += own * rank;
+        square += rank * rank;
+      }
+      m_.item[n].first_row = m_.size[m_.label[n]];
+      m_.size[m_.label[n]] += m_.item[n].pair.rows();
+    }
+    m_.counts->rows = rows;
+    m_.counts->patches = patches;
+    m_.counts->low = low;
+    m_.counts->square = square;
+    m_.counts->skewed = 0;
+  }
+
+  template <class I>
+  PD_HD static I min_of(I a, I b) {
+    return b < a ? b : a;
+  }
+
+  template <class Projector, class Sliding>
+  PD_HD void write_row(int number, int k, const Projector& projector, const Sliding& sliding) {
+    const PairItem& item = m_.item[number];
+    const double scale = sqrt(item.step);
+    PairRow& row = m_.row[item.first_row + k];
+    bool skewed = item.pair.state != PairState::smooth;
+    row.item = number;
+    for (int a = 0; a < 4; ++a) {
+      const int v = item.moves[a];
+      row.held[a] = row.pushed[a] = {0, 0, 0};
+      if (v < 0) continue;
+      const auto part = [&](const double (&from)[12]) {
+        return scale * Place{from[3 * a], from[3 * a + 1], from[3 * a + 2]};
+      };
+      Place pushed = part(item.slopes.column[k]);
+      if (const T* s = sliding(v)) {
+        skewed = skewed || slides(s);
+        pushed = pushed + dot(pushed, at(s + 3 * slide_normal)) * at(s + 3 * slide_along);
+      }
+      row.held[a] = projected(part(item.slopes.row[k]), projector(v));
+      row.pushed[a] = projected(pushed, projector(v));
+    }
+    if (skewed) team_.add(&m_.counts->skewed, 1);
+  }
+
+  PD_HD static Place projected(const Place& field, const T* p) {
+    if (!p) return field;
+    return Mat3<double>{{at(p), at(p + 3), at(p + 6)}} * field;
+  }
+
+  // ---- gradients
+
+  // Sums the parts of corners, by the places of bodies and the poses of colliders.
+  PD_HD void to_places(const Vec3<double>* part, const T* poses, T* bodies, T* to) const {
+    team_.each(plan_.vertices, [&](int node) {
+      const Place sum = sum_of(node, part);
+      m_.field[node] = sum;
+      if (node >= count_) return;
+      T* const own = bodies + 3 * (environment_ * count_ + order_[node]);
+      own[0] = T(sum.x), own[1] = T(sum.y), own[2] = T(sum.z);
+    });
+    team_.dots(
+        7 * std::int64_t(plan_.colliders), [&](int) { return plan_.vertices - count_; },
+        [&](int n, int v) { return by_pose(n, count_ + v, poses); },
+        [&](int n, double sum) { to[7 * environment_ * plan_.colliders + n] = T(-sum); });
+  }
+
+  // By number n of the poses, from the place of one vertex. With u = axis x p a vertex is at
+  // origin + p + 2 w u + 2 axis x u.
+  PD_HD double by_pose(int n, int v, const T* poses) const {
+    if (plan_.collider[v] != n / 7) return 0;
+    const T* const pose = poses + 7 * (environment_ * plan_.colliders + plan_.collider[v]);
+    const Place p = at(plan_.local + 3 * std::int64_t(v - count_)), axis = at(pose + 4),
+                g = m_.field[v], u = cross(axis, p);
+    const double w(pose[3]);
+    const Place turned = 2.0 * (w * cross(p, g) + cross(u, g) + cross(p, cross(g, axis)));
+    const double own[7] = {g.x, g.y, g.z, 2 * dot(g, u), turned.x, turned.y, turned.z};
+    return own[n % 7];
+  }
+
+  // f = lambda (n - mu s / |s|): column 0 of B less that of a smooth pair, over -mu
+  template <class Read>
+  PD_HD void to_friction(const Read& read, T* to) const {
+    team_.each(m_.counts->pairs, [&](int number) {
+      const PairItem& item = m_.item[number];
+      double l[12], work = 0;
+      gather(item, read, l);
+      for (int a = 0; a < 4; ++a) {
+        const Place normal = item.pair.frame.weight[a] * item.pair.frame.normal;
+        work += l[3 * a] * (item.slopes.column[0][3 * a] - normal.x) +
+                l[3 * a + 1] * (item.slopes.column[0][3 * a + 1] - normal.y) +
+                l[3 * a + 2] * (item.slopes.column[0][3 * a + 2] - normal.z);
+      }
+      const bool slides = item.pair.state == PairState::slides;
+      m_.along[number] = slides ? item.pair.normal_force * work / item.pair.friction : 0.0;
+    });
+    const std::int64_t tables = std::int64_t(plan_.bodies) * plan_.bodies;
+    team_.each(tables, [&](int n) { m_.friction[n] = 0; });
+    team_.once([&] {
+      for (int n = 0; n < m_.counts->pairs; ++n) m_.friction[m_.item[n].bodies] += m_.along[n];
+    });
+    team_.each(tables, [&](int n) { to[n] = T(m_.friction[n]); });
+  }
+
+  const LoadedPairs<T>& call_;
+  const ContactPlan<T>& plan_;
+  const int* order_;
+  const Team& team_;
+  const PairMemory& m_;
+  std::int64_t environment_;
+  int count_;  // vertices of bodies
+  PairRows<Team> rows_;
+};
+
+}  // namespace pd::inline PD_TARGET
