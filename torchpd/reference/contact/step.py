@@ -252,8 +252,8 @@ class _Run:
         component = torch.full((len(x),), -1)
         component[: scene.count] = torch.tensor(problem.values.component)
         component[scene.count :] -= 1 + scene.collider[scene.count :]
-        numbers, pairs = pairs_between(problem, contacts, contacts.near(x), x, self.begin)
         near = contacts.near(x)
+        numbers, pairs = pairs_between(problem, contacts, near, x, self.begin)
         push = forces(contacts.pairs, near.weights, contacts.normals(near), contacts.held, len(x))
         gradient = np.where(problem.free[:, None], problem.gradient(u) - _array(push[: scene.count]), 0.0)
         moved = correct(problem, u, pushes_of(problem, u, gradient), pairs, push_pairs=False, passes=PASSES)
@@ -312,9 +312,10 @@ class _Run:
             target = self._by_hand(self._place(problem.project(self._displacement(target), self._displacement(places))))
         if swept:
             self._search(target)
-        self.contacts = self.contacts.refreshed(places, places, self.contacts.near(places))
+        near = self.contacts.near(places)
+        self.contacts = self.contacts.refreshed(places, places, near)
         if pushes.any():
-            self.contacts = self.contacts.refreshed(places, target, self.contacts.near(places))
+            self.contacts = self.contacts.refreshed(places, target, near)
             self._move(target)
         self.previous = before + self.current - x
         return cut
