@@ -8,19 +8,13 @@
 #pragma once
 #include "solver/coarse/island.h"
 #include "solver/contact/approach.h"
+#include "solver/contact/schedule.h"
 
 namespace pd::inline PD_TARGET {
 
-constexpr int coarse_pause = 8;   // iterations between coarse corrections
-constexpr int coarse_trials = 4;  // where a motion is cut, forces grow with the gaps of now, and another one follows
-constexpr int coarse_last = 2;    // iterations before the last one, in which none comes
 // Of the chord of a turn up to a right angle: how far a share of it leaves the straight way.
 constexpr double turn_bow = 0.25;
 constexpr int coarse_halvings = 6;  // of the interval of a share
-
-PD_HD bool has_correction(int k, int iterations) {
-  return k > 0 && k % coarse_pause == 0 && iterations - k > coarse_last;
-}
 
 template <class T>
 class ContactCorrection {
