@@ -68,8 +68,7 @@ def test_bits_of_the_steps_with_contact(dtype: torch.dtype, ground: bool) -> Non
         state.history.forces[:, 0, 0] = 1.0
         state, info = met(state, return_info=True)
         plain = alone(plain)
-        assert int(info.contact_searches) > 0
-        assert int(info.contact_pairs) == 0
+        assert torch.isinf(info.contact_gap).all()
         assert torch.equal(state.positions, plain.positions)
         assert torch.equal(state.velocities, plain.velocities)
 

@@ -320,7 +320,10 @@ class ContactCorrection {
         a_.side_start[g], a_.side_start[g + 1],
         [&](int n, auto& sum) {
           const int p = a_.side_pair[n], a = component_of(p, 0), side = a == g ? 0 : 1;
-          add_terms(sum, a_.terms[p].of_side(side, side == 0 || a < 0));
+          const PairTerms& of = a_.terms[p];
+          const bool counts = side == 0 || a < 0;
+          if (of.resists()) return add_terms(sum, of.of_side(side, counts));
+          if (counts) sum[ContactSums::before] += of.before;  // no force: the other numbers are 0
         },
         sums);
     if (!group.leads()) return;
