@@ -90,13 +90,14 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     if (has_correction(k, set_.iterations)) correct();
     const T omega(next_omega_[0]);
     const bool guards = schedule_[0].checks_energy(k);
-    const auto gradient = elastic_gradient<true>(guards);
-    sweep_.run(k & 1, gradient, [&](std::int64_t i, const Value& force, Sum& sums) {
+    const auto free = [&](std::int64_t i, const Value& force, Sum& sums) {
       const auto v = vertex(i);
       if (guards) sums.energy = v.add_energy(w_.u[i], sums.energy);
       w_.before[i] = accelerate(w_.u[i], w_.before[i], v.gradient(w_.u[i], force),
                                 theta_ * w_.inverse[i], omega);
-    });
+    };
+    guards ? sweep_.run(k & 1, elastic_gradient<true>(), free)
+           : sweep_.run(k & 1, elastic_gradient<false>(), free);
     ++used_[0];
     next_omega_[0] = schedule_[0].next(k + 1);
     const double energy = guards ? double(this->total(k & 1).energy) : 0.0;

@@ -3,7 +3,7 @@
 #pragma once
 #include "cuda/contact/launch.h"
 #include "cuda/stream/runner.cuh"
-#include "solver/contact/coarse.h"
+#include "solver/contact/schedule.h"
 
 namespace pd::inline PD_TARGET {
 

@@ -13,13 +13,13 @@
 namespace pd::inline PD_TARGET {
 
 // The point of a pair on one side.
-struct PairSide {
+struct CoarseSide {
   int body;          // -1: does not move
   Vec3<double> arm;  // from the centre of the body, at the iterate
 };
 
 struct CoarsePair {
-  PairSide side[2];
+  CoarseSide side[2];
   Vec3<double> normal, slip, force;  // toward side A; of the iterate; on side A, at the iterate
   double gap, yielding, friction;    // 1 / k
 

@@ -8,19 +8,13 @@
 #pragma once
 #include "solver/coarse/island.h"
 #include "solver/contact/approach.h"
+#include "solver/contact/schedule.h"
 
 namespace pd::inline PD_TARGET {
 
-constexpr int coarse_pause = 8;   // iterations between coarse corrections
-constexpr int coarse_trials = 4;  // where a motion is cut, forces grow with the gaps of now, and another one follows
-constexpr int coarse_last = 2;    // iterations before the last one, in which none comes
 // Of the chord of a turn up to a right angle: how far a share of it leaves the straight way.
 constexpr double turn_bow = 0.25;
 constexpr int coarse_halvings = 6;  // of the interval of a share
-
-PD_HD bool has_correction(int k, int iterations) {
-  return k > 0 && k % coarse_pause == 0 && iterations - k > coarse_last;
-}
 
 template <class T>
 class ContactCorrection {
@@ -326,7 +320,10 @@ class ContactCorrection {
         a_.side_start[g], a_.side_start[g + 1],
         [&](int n, auto& sum) {
           const int p = a_.side_pair[n], a = component_of(p, 0), side = a == g ? 0 : 1;
-          add_terms(sum, a_.terms[p].of_side(side, side == 0 || a < 0));
+          const PairTerms& of = a_.terms[p];
+          const bool counts = side == 0 || a < 0;
+          if (of.resists()) return add_terms(sum, of.of_side(side, counts));
+          if (counts) sum[ContactSums::before] += of.before;  // no force: the other numbers are 0
         },
         sums);
     if (!group.leads()) return;

@@ -242,8 +242,7 @@ struct BodyState {
   const int *order, *component;    // user's number; component that moves rigidly, or -1
   const T* x;                      // at the start of the step
   T *u, *before;                   // displacement of the iterate, and of the one before
-  T *target, *saved;               // s; of a vertex before a coarse correction
-  const T* free;                   // of the free iterate
+  T *target, *saved, *free;        // s; before a coarse correction; of the free iterate, with planes and spheres
   const T *inverse, *inertia;      // every `stride` numbers
   const T* mass;                   // by the user's number
   int stride, vertices, components;
@@ -258,6 +257,12 @@ struct BodyState {
   }
   PD_HD Vec3<T> place(int i, const Vec3<T>& displacement) const {
     return read(x, i) + displacement;
+  }
+  // The displacement to a place: the bits of the free iterate where it leads there.
+  PD_HD Vec3<T> displacement_to(const Vec3<T>& to, int i) const {
+    const Vec3<T> own = read(free, i), there = place(i, own);
+    const bool same = there.x == to.x && there.y == to.y && there.z == to.z;
+    return same ? own : to - read(x, i);
   }
   PD_HD T inverse_of(int i) const { return inverse[std::int64_t(i) * stride]; }
   PD_HD T inertia_of(int i) const { return inertia[std::int64_t(i) * stride]; }
@@ -321,9 +326,9 @@ struct ContactEnvironment {
   }
   // calls visit(normal, bound, margin) for all half-spaces of a vertex
   template <class Visit>
-  PD_HD void each_space(int v, const Visit& visit, bool planes = true) const {
+  PD_HD void each_space(int v, const Visit& visit) const {
     PD_UNROLL_4
-    for (int n = a.start[v]; planes && n < a.start[v + 1]; ++n) {
+    for (int n = a.start[v]; n < a.start[v + 1]; ++n) {
       const Four<T> space = a.space[n];
       visit(Vec3<T>{space.x, space.y, space.z}, space.w, a.margin[n]);
     }

@@ -294,7 +294,9 @@ class ContactSteps {
   // Targets of the next move: displacements of bodies, and the goals of what moves by hand.
   PD_HD void want_vertex(int i, const T* displacement) const {
     const int v = body_.order[i];
-    a_.target[v] = env_.held(v) ? a_.goal[v] : body_.place(i, BodyState<T>::read(displacement, i));
+    const Vec3<T> u = BodyState<T>::read(displacement, i);
+    BodyState<T>::write(body_.free, i, u);
+    a_.target[v] = env_.held(v) ? a_.goal[v] : body_.place(i, u);
   }
   template <class Team>
   PD_HD void want(const Team& team, const T* displacement) const {
@@ -310,8 +312,10 @@ class ContactSteps {
   PD_HD void leave_walls(int i) const {
     if (!env_.walls.exist()) return;
     Vec3<T>& target = a_.target[body_.order[i]];
-    const Vec3<T> u = target - BodyState<T>::read(body_.x, i);
-    target = body_.place(i, body_.vertex(i).project(env_.walls, u, BodyState<T>::read(body_.u, i)));
+    const Vec3<T> u = body_.vertex(i).project(env_.walls, body_.displacement_to(target, i),
+                                              BodyState<T>::read(body_.u, i));
+    BodyState<T>::write(body_.free, i, u);
+    target = body_.place(i, u);
   }
 
   // Closest points and normals at the present iterate.
@@ -417,7 +421,7 @@ class ContactSteps {
       const int v = body_.order[i];
       move_vertex(v);
       const Vec3<T> u = BodyState<T>::read(body_.u, i),
-                    next = a_.place[v] - BodyState<T>::read(body_.x, i), way = next - u;
+                    next = body_.displacement_to(a_.place[v], i), way = next - u;
       BodyState<T>::write(body_.u, i, next);
       BodyState<T>::write(body_.before, i, a_.cut[v] ? next : u);
       if (!measures) return;
@@ -460,10 +464,12 @@ class ContactSteps {
       return;
     }
     Vec3<T> inside = a_.target[v];
-    const bool planes = a_.limits[v] != limits_none || move_into(a_.ball[v], inside);
-    const LimitedPlace<T> to =
-        limit(a_.target[v], from, a_.ball[v],
-              [&](const auto& visit) { env_.each_space(v, visit, planes); });
+    if (a_.limits[v] == limits_none && !move_into(a_.ball[v], inside)) {
+      a_.place[v] = a_.target[v];  // planes and spheres of the scene have moved it
+      return;
+    }
+    const LimitedPlace<T> to = limit(a_.target[v], from, a_.ball[v],
+                                     [&](const auto& visit) { env_.each_space(v, visit); });
     a_.place[v] = to.place;
     if (to.shortened) cut(v);
   }

@@ -48,7 +48,7 @@ PAUSE = 5  # least iterations between searches: a guard that every search blinds
 SWEEPS = 8  # with 4 an edge that lies on an edge cycles
 PASSES = 64  # of a coarse correction; most of them take 5 to 30
 TRIALS = 4  # of a coarse correction whose motions are cut
-EVERY = 8  # iterations between coarse corrections
+FIRST = 8  # iterations before the first coarse correction between; then their number doubles
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def contact_step(
     if observe is not None:
         observe(0, run.current)
     for k in range(iterations):
-        if k and k % EVERY == 0 and iterations - k > 2:
+        if k >= FIRST and k & (k - 1) == 0 and iterations - k > 2:
             run.correct()
         run.iterate(k)
         if observe is not None:
