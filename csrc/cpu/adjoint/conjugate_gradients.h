@@ -232,7 +232,7 @@ class ConjugatePass {
       if (cycle_) return cycle_->result()[i];
       return w_.inverse[i] * (stage == FrictionStage::first ? f_.search : residual())[i];
     };
-    if constexpr (HasPairs) slant(z);
+    if constexpr (HasPairs) slant(stage == FrictionStage::residual ? 2 : 1, z);
     const auto moved = [&](std::int64_t i) { return HasPairs ? f_.slanted[i] : z(i); };
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i)
       direction()[i] = against_friction(moved(i), i);
@@ -340,10 +340,10 @@ class ConjugatePass {
 
   // Moves of z that the forces of all pairs do not resist.
   template <class Z>
-  void slant(const Z& z) {
+  void slant(int rounds, const Z& z) {
     for (std::int64_t i = 0; i < plan_.vertices; ++i) f_.slanted[i] = z(i);
     pairs_->rows().slant(
-        [&](int i) { return in_double(f_.slanted[i]); },
+        rounds, [&](int i) { return in_double(f_.slanted[i]); },
         [&](int i, const Vec3<double>& a) { f_.slanted[i] = plus(f_.slanted[i], a); });
   }
 
@@ -406,7 +406,7 @@ class ConjugatePass {
   // `slides`: the multiplier is G^T times the solution
   void store(bool slides) {
     if (HasPairs && slides) {
-      slant([&](std::int64_t i) { return solution()[i]; });
+      slant(2, [&](std::int64_t i) { return solution()[i]; });
       std::copy_n(f_.slanted, plan_.vertices, solution());
     }
     for (std::int64_t i = team_.begin(plan_.vertices); i < team_.end(plan_.vertices); ++i) {

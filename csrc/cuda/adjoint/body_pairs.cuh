@@ -85,9 +85,10 @@ struct BodyPairs<Work, true> {
                        [&](int i, const Vec3<double>& a) { add(field[i], a); });
   }
   // Moves that the forces of all pairs do not resist.
-  __device__ void slant(Quad<T>* field) const {
-    all.rows().slant([&](int i) { return in_double(vec3(field[i])); },
-                     [&](int i, const Vec3<double>& a) { add(field[i], a); });
+  __device__ void slant(int rounds, Quad<T>* field) const {
+    all.rows().slant(
+        rounds, [&](int i) { return in_double(vec3(field[i])); },
+        [&](int i, const Vec3<double>& a) { add(field[i], a); });
   }
   // Adds what the pairs have of the matrix, transposed or by its positive part, times a field.
   template <class Field, class Projector>

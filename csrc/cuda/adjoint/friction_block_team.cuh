@@ -117,7 +117,7 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
 
   // Replaces the solution y by the multiplier G^T y.
   __device__ void press_solution() {
-    if constexpr (has_pairs) pairs_.slant(m_.solution);
+    if constexpr (has_pairs) pairs_.slant(2, m_.solution);
     each_vertex([&](int i) { m_.solution[i] = quad(press(vec3(m_.solution[i]), i)); });
   }
 
@@ -176,7 +176,7 @@ class FrictionTeam : ConjugateTeam<Work, WithLevels, Computed> {
     if constexpr (has_pairs) {
       each_vertex([&](int i) { m_.slanted[i] = quad(z(stage, i)); });
       team_.barrier();
-      pairs_.slant(m_.slanted);
+      pairs_.slant(stage == FrictionStage::residual ? 2 : 1, m_.slanted);
       Base::multiply(
           pressed,
           [&](int i, const Vec3<T>& elastic, const Vec3<T>&) {

@@ -24,9 +24,9 @@ class OneThread {
   // item(first, width): some numbers from `first` on, as many as are good to take together
   template <class Item>
   void strips(int count, const Item& item) const {
-    constexpr int width = 8;
     int i = 0;
-    for (; i + width <= count; i += width) item(i, std::integral_constant<int, width>());
+    for (; i + 32 <= count; i += 32) item(i, std::integral_constant<int, 32>());
+    for (; i + 4 <= count; i += 4) item(i, std::integral_constant<int, 4>());
     for (; i < count; ++i) item(i, std::integral_constant<int, 1>());
   }
   template <class Item>

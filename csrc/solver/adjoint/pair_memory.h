@@ -23,8 +23,6 @@ struct PairItem {
 // C and B of one row, at the corners that move.
 struct PairRow {
   Vec3<double> held[4], pushed[4];
-  int item;
-  int pivot;  // its number among the independent rows, or -1
 };
 
 // Rows that share no vertex with others, directly or through others.
@@ -55,6 +53,8 @@ struct PairSizes {
 struct PairMemory {
   PairItem* item;
   PairRow* row;
+  int *of_item, *as_pivot;  // [rows] item, and number among the independent rows, or -1
+  int* corner;              // [4 rows] nodes that move, or -1
   PairPatch* patch;
   int* slot;                  // [keys + 1] items before each key
   int* internal;              // [vertices] internal numbers of the user's
@@ -76,6 +76,8 @@ struct PairMemory {
   PD_HD void arrange(Arena& arena, const PairSizes& s) {
     arena.place(item, s.pairs);
     arena.place(row, s.rows());
+    for (int** array : {&of_item, &as_pivot}) arena.place(*array, s.rows());
+    arena.place(corner, 4 * s.rows());
     arena.place(patch, s.pairs);
     arena.place(slot, s.keys + 1);
     arena.place(internal, s.vertices);

@@ -37,7 +37,7 @@ class PairRows {
       double sum = 0;
       each_held(p, [&](int v, const Place& c) { sum += m_.inverse[v] * dot(c, c); });
       m_.whole[p] = m_.left[p] = sum;
-      m_.row[p].pivot = -1;
+      m_.as_pivot[p] = -1;
     });
     std::int64_t low = 0, square = 0;
     int pivots = 0;
@@ -69,13 +69,14 @@ class PairRows {
     }
   }
 
+  // `rounds`: 1 suffices for a direction of search, whose product shows what it is.
   template <class Read, class Add>
-  PD_HD void slant(const Read& read, const Add& add) const {
+  PD_HD void slant(int rounds, const Read& read, const Add& add) const {
     if (!skewed_) return;  // moves off the rows
     PD_ROLLED
-    for (int round = 0; round < 2; ++round) {
+    for (int round = 0; round < rounds; ++round) {
       team_.each(m_.counts->rows, [&](int p) {
-        const int* const moves = m_.item[m_.row[p].item].moves;
+        const int* const moves = m_.corner + 4 * std::int64_t(p);
         double sum = 0;
         for (int a = 0; a < 4; ++a)
           if (moves[a] >= 0) sum += dot(m_.row[p].pushed[a], read(moves[a]));
@@ -106,9 +107,18 @@ class PairRows {
   }
 
  private:
+  // Place `at` in the lower triangle of a matrix, counted row by row.
+  struct Corner {
+    int row, column;
+
+    PD_HD explicit Corner(int at) : row(int((sqrt(8.0 * at + 1) - 1) / 2)) {
+      column = at - row * (row + 1) / 2;
+    }
+  };
+
   template <class Visit>
   PD_HD void each_held(int p, const Visit& visit) const {
-    const int* const moves = m_.item[m_.row[p].item].moves;
+    const int* const moves = m_.corner + 4 * std::int64_t(p);
     for (int a = 0; a < 4; ++a)
       if (moves[a] >= 0) visit(moves[a], m_.row[p].held[a]);
   }
@@ -191,8 +201,8 @@ class PairRows {
         const int a = m_.entry[n] % 4;
         if (item.moves[a] < 0) continue;
         for (int p = item.first_row; p < item.first_row + item.pair.rows(); ++p) {
-          if (m_.row[p].pivot < 0) continue;
-          sum = sum + m_.sums[m_.row[p].pivot] * m_.row[p].held[a];
+          if (m_.as_pivot[p] < 0) continue;
+          sum = sum + m_.sums[m_.as_pivot[p]] * m_.row[p].held[a];
           some = true;
         }
       }
@@ -210,8 +220,8 @@ class PairRows {
 
   // Row p D^-1 C_q^T
   PD_HD double coupled(int p, int q) const {
-    const int *const of_p = m_.item[m_.row[p].item].moves, *const of_q =
-                                                               m_.item[m_.row[q].item].moves;
+    const int* const of_p = m_.corner + 4 * std::int64_t(p);
+    const int* const of_q = m_.corner + 4 * std::int64_t(q);
     double sum = 0;
     for (int b = 0; b < 4; ++b) {
       for (int a = 0; a < 4; ++a) {
@@ -234,13 +244,14 @@ class PairRows {
       const int best = next.index;
       const double scale = 1 / sqrt(m_.left[begin + best]);
       double* const column = column_of(patch, rank);
+      team_.each(rank, [&](int k) { m_.column[k] = column_of(patch, k)[best]; });
       team_.strips(rows, [&](int first, auto width) {
         double own[width];
         for (int u = 0; u < width; ++u) own[u] = coupled(begin + first + u, begin + best);
-        for (int k = 0; k < rank; ++k) {
-          const double* const other = column_of(patch, k);
-          const double by = other[best];
-          for (int u = 0; u < width; ++u) own[u] -= by * other[first + u];
+        const double* other = column_of(patch, 0) + first;
+        for (int k = 0; k < rank; ++k, other += rows) {
+          const double by = m_.column[k];
+          for (int u = 0; u < width; ++u) own[u] -= by * other[u];
         }
         for (int u = 0; u < width; ++u) column[first + u] = scale * own[u];
       });
@@ -249,7 +260,7 @@ class PairRows {
       });
       team_.once([&] {
         m_.pivot[patch.first_pivot + rank] = begin + best;
-        m_.row[begin + best].pivot = patch.first_pivot + rank;
+        m_.as_pivot[begin + best] = patch.first_pivot + rank;
       });
     }
   }
@@ -313,11 +324,16 @@ class PairRows {
       const int rank = patch.rank;
       double* const to = f_.mixed + patch.square;
       team_.dots(
-          std::int64_t(rank) * rank, [&](int) { return rows_of(patch); },
+          std::int64_t(rank) * (rank + 1) / 2, [&](int) { return rows_of(patch); },
           [&](int at, int p) {
-            return column_of(patch, at / rank)[p] * column_of(patch, at % rank)[p];
+            const Corner of(at);
+            return column_of(patch, of.row)[p] * column_of(patch, of.column)[p];
           },
-          [&](int at, double sum) { to[at] = sum; });
+          [&](int at, double sum) {
+            const Corner of(at);
+            to[std::int64_t(of.row) * rank + of.column] = sum;
+            to[std::int64_t(of.column) * rank + of.row] = sum;
+          });
       invert(to, rank);
     }
   }

@@ -92,7 +92,7 @@ class AdjointPairs {
   PD_CALLED void differentiate(const Read& read, double* nu, const PairGradients<T>& out) const {
     const int pairs = m_.counts->pairs;
     // in newtons and so on, from those of scaled rows
-    team_.each(m_.counts->rows, [&](int p) { nu[p] *= sqrt(m_.item[m_.row[p].item].step); });
+    team_.each(m_.counts->rows, [&](int p) { nu[p] *= sqrt(m_.item[m_.of_item[p]].step); });
     team_.each(4 * std::int64_t(pairs), [&](int n) {
       const PairItem& item = m_.item[n / 4];
       double l[12], end[3], start[3];
@@ -347,11 +347,13 @@ class AdjointPairs {
   PD_HD void write_row(int number, int k, const Projector& projector, const Sliding& sliding) {
     const PairItem& item = m_.item[number];
     const double scale = sqrt(item.step);
-    PairRow& row = m_.row[item.first_row + k];
+    const int p = item.first_row + k;
+    PairRow& row = m_.row[p];
     bool skewed = item.pair.state != PairState::smooth;
-    row.item = number;
+    m_.of_item[p] = number;
     for (int a = 0; a < 4; ++a) {
       const int v = item.moves[a];
+      m_.corner[4 * std::int64_t(p) + a] = v;
       row.held[a] = row.pushed[a] = {0, 0, 0};
       if (v < 0) continue;
       const auto part = [&](const double (&from)[12]) {
