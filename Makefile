@@ -34,9 +34,10 @@ setup:
 demo: setup
 	$(BIN)/python -m torchpd demo $(DEMO_ARGS)
 
-# A process for each core, of which more than eight would want much memory and speed up little.
+# A process for each core, of which more than eight would want much memory and speed up little. Tests of a file stay
+# together, which share scenes, until a process has none left.
 test: setup
-	$(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 --dist=worksteal $(PYTEST_ARGS)
 
 coverage: setup
 	$(BIN)/python -m pytest --cov --cov-report=term $(PYTEST_ARGS)
