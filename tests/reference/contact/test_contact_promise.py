@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import torch
 from contact_scenes import (
-    H,
     ContactCase,
+    H,
     Witness,
     ball_on_sheet,
     fixed_edge,
