@@ -1,12 +1,12 @@
 // Kernels of cuda/contact/launch.h: a team of blocks takes one environment after another.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/inputs.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/teams.cuh"
 #include "cuda/contact/launch.h"
 #include "cuda/contact/team.cuh"
 #include "solver/contact/step.h"
+#include "views/arena.h"
 
 #include <algorithm>
 
