@@ -9,6 +9,8 @@ BIN := $(VENV)/bin
 NATIVE_SOURCES := $(shell find csrc -name '.*' -prune -o -print 2>/dev/null)
 CXX_FILES = $(shell find csrc -type f \( -name '*.cpp' -o -name '*.h' -o -name '*.cu' -o -name '*.cuh' -o -name '*.inl' \))
 PYTHONS := python3 python3.14 python3.13 python3.12 python3.11 python3.10
+# Modules are compiled once, at their first import, whatever the environment says: torch takes twice as long without.
+export PYTHONDONTWRITEBYTECODE :=
 PYTEST_ARGS ?=
 DEMO_ARGS ?=
 BENCH_ARGS ?=
@@ -32,9 +34,10 @@ setup:
 demo: setup
 	$(BIN)/python -m torchpd demo $(DEMO_ARGS)
 
-# A process for each core, of which more than eight would want much memory and speed up little.
+# A process for each core, of which more than eight would want much memory and speed up little. Tests of a file stay
+# together, which share scenes, until a process has none left.
 test: setup
-	$(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses=auto --maxprocesses=8 --dist=worksteal $(PYTEST_ARGS)
 
 coverage: setup
 	$(BIN)/python -m pytest --cov --cov-report=term $(PYTEST_ARGS)

@@ -6,18 +6,18 @@ import os
 from collections.abc import Iterator
 
 import pytest
+
+# Beside each other the processes of pytest-xdist share the cores; with more threads than that they wait for each other.
+# Before torch, which loads numpy: its BLAS counts the cores then.
+if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
+    share = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
+    os.environ.setdefault("OMP_NUM_THREADS", str(share))
+
 import torch
 from devices import missing_gpu
 
 # before cuBLAS starts: with deterministic algorithms, see `poisoned`, torch warns of a workspace of any other size
 os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-
-
-# Beside each other the processes of pytest-xdist share the cores; with more threads than that they wait for each other.
-if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
-    share = max(1, (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))
-    torch.set_num_threads(share)
-    os.environ.setdefault("OMP_NUM_THREADS", str(share))  # of what tests start
 
 
 def _devices() -> list[str]:

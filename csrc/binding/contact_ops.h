@@ -23,9 +23,9 @@ enum ContactArray : int {
   contact_body,
   contact_collider,
   contact_touches_itself,
-  contact_point_order,
-  contact_triangle_order,
-  contact_edge_order,
+  contact_leaves,
+  contact_cluster_body,
+  contact_starts,
   contact_rest_key,
   contact_rest_thickness,
   contact_rest,
@@ -38,7 +38,14 @@ enum ContactArray : int {
 };
 
 // Counts in contact.sizes.
-enum ContactSize : int { size_bodies, size_colliders, size_capacity, contact_size_count };
+enum ContactSize : int {
+  size_bodies,
+  size_colliders,
+  size_capacity,
+  size_point_clusters,
+  size_edge_clusters,
+  contact_size_count
+};
 
 template <class T>
 ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertices,
@@ -51,6 +58,8 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
   plan.bodies = sizes[size_bodies];
   plan.colliders = sizes[size_colliders];
   plan.capacity = sizes[size_capacity];
+  plan.point_clusters = sizes[size_point_clusters];
+  plan.edge_clusters = sizes[size_edge_clusters];
   const auto array = [&](ContactArray which, at::ScalarType type, std::int64_t rows,
                          std::int64_t width, const char* meaning) -> const void* {
     check_array(arrays[which], type, rows, width, place, "contact", meaning);
@@ -80,9 +89,12 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
   plan.collider = ints(contact_collider, plan.vertices, 1, "collider of each vertex");
   plan.touches_itself =
       ints(contact_touches_itself, plan.bodies, 1, "whether bodies touch themselves");
-  plan.point_order = ints(contact_point_order, plan.points, 1, "leaves of a tree");
-  plan.triangle_order = ints(contact_triangle_order, plan.triangles, 1, "leaves of a tree");
-  plan.edge_order = ints(contact_edge_order, plan.edges, 1, "leaves of a tree");
+  plan.clusters = int(rows_of_array(contact_cluster_body));
+  plan.leaves = ints(contact_leaves, std::int64_t(4) * plan.clusters, 32, "sides of clusters");
+  plan.cluster_body = ints(contact_cluster_body, plan.clusters, 1, "body of each cluster");
+  plan.body_start =
+      ints(contact_starts, 2, plan.bodies + 1, "first vertices of bodies, all and of surfaces");
+  plan.surface_start = plan.body_start + plan.bodies + 1;
   plan.rest_key = static_cast<const std::int64_t*>(array(
       contact_rest_key, at::kLong, plan.rest_pairs, 1, "keys of pairs that are close at rest"));
   plan.rest_thickness = reals(contact_rest_thickness, plan.rest_pairs, 1, "their thickness [m]");

@@ -10,7 +10,10 @@ struct ContactPlan {
   const int *triangle, *edge, *point;                    // [triangles, 3], [edges, 2], [points]
   const int *body, *collider;                            // [vertices]; -1 for vertices of bodies
   const int* touches_itself;                             // [bodies]
-  const int *point_order, *triangle_order, *edge_order;  // leaves of the trees
+  // Clusters of up to 32 sides of one body: of points, then of edges, then of triangles. A cluster
+  // has the numbers of its sides, -1 past the last one, and their corners, the last one repeated.
+  const int *leaves, *cluster_body;       // [clusters, 4, 32]; [clusters]
+  const int *body_start, *surface_start;  // [bodies + 1] first vertex; first row of `point`
   const std::int64_t*
       rest_key;             // [rest_pairs] of pairs that are closer than 2 r at rest, increasing
   const T* rest_thickness;  // [rest_pairs]
@@ -19,7 +22,7 @@ struct ContactPlan {
   const T *rest, *rest_apart;
   const T *local, *cell, *friction;  // [vertices, 3] of colliders; [vertices]; [bodies, bodies]
   int vertices = 0, body_vertices = 0, triangles = 0, edges = 0, points = 0, bodies = 0,
-      colliders = 0, capacity = 0;
+      colliders = 0, capacity = 0, clusters = 0, point_clusters = 0, edge_clusters = 0;
   std::int64_t rest_pairs = 0;
   T thickness = 0;
 };

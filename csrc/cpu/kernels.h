@@ -1,8 +1,5 @@
 // The compiled physics of one instruction set. Included once by each cpu/isa_*.cpp, after cpu/target.
 #pragma once
-#include "cpu/adjoint/conjugate_gradients.h"
-#include "cpu/adjoint/energy_fields.h"
-#include "cpu/adjoint/system.h"
 #include "cpu/multilevel/newton.h"
 #include "cpu/multilevel/stepper.h"
 #include "cpu/step/clean_registers.h"
@@ -65,13 +62,6 @@ void step_batches(const StepCall<T>& call, int threads) {
   });
 }
 
-template <class Lanes, class T>
-std::vector<Scratch<Lanes>> make_scratches(const Plan<T>& plan, int threads) {
-  std::vector<Scratch<Lanes>> scratches;
-  for (int i = 0; i < threads; ++i) scratches.emplace_back(plan.most_slots);
-  return scratches;
-}
-
 // One environment after another by the whole team, or each by one thread when it has too few patches to share.
 template <bool HasContacts, class T>
 void step_singles(const StepCall<T>& call, int threads) {
@@ -113,50 +103,21 @@ void step_any(const StepCall<T>& call, int threads) {
 template void step_any(const StepCall<float>&, int);
 template void step_any(const StepCall<double>&, int);
 
-// In a translation unit of its own: cpu/contact/kernels.h.
+// In translation units of their own: cpu/contact/kernels.h and cpu/adjoint/kernels.h.
 template <class T>
 void contact_step_any(const StepCall<T>& call, const ContactCall<T>& contact, int threads);
-
 template <class T>
-void field_any(const FieldCall<T>& call, int threads) {
-  using Lanes = Single<T>;
-  Workspace<Lanes> work(call);
-  auto scratches = make_scratches<Lanes>(call.plan, threads);
-  run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
-    const CleanRegisters clean;
-    FieldPass<T> pass(call, work, scratches[team.rank], team);
-    for (std::int64_t e = 0; e < call.batch; ++e) pass.run(e);
-  });
-}
-
-// Environments run side by side where they have too few patches to share.
+void field_any(const FieldCall<T>& call, int threads);
 template <class T>
-void conjugate_any(const ConjugateCall<T>& call, int threads) {
-  using Lanes = Single<T>;
-  if (call.batch > 1 && call.plan.patches < 2 * threads) {
-    std::atomic<std::int64_t> next{0};
-    run_team(int(std::min<std::int64_t>(threads, call.batch)), [&](const Team& team) {
-      const CleanRegisters clean;
-      ConjugateMemory<T, false> work(call);
-      Scratch<Lanes> scratch(call.plan.most_slots);
-      const Team alone = team.alone();
-      ConjugatePass<T> pass(call, work, scratch, alone);
-      for (std::int64_t e = next++; e < call.batch; e = next++) pass.run(e);
-    });
-    return;
-  }
-  ConjugateMemory<T, false> work(call);
-  auto scratches = make_scratches<Lanes>(call.plan, threads);
-  run_team(std::min(threads, call.plan.patches), [&](const Team& team) {
-    const CleanRegisters clean;
-    ConjugatePass<T> pass(call, work, scratches[team.rank], team);
-    for (std::int64_t e = 0; e < call.batch; ++e) pass.run(e);
-  });
-}
-
-// In a translation unit of their own: cpu/adjoint/contact_kernels.h.
+void conjugate_any(const ConjugateCall<T>& call, int threads);
 template <class T>
 void contact_conjugate_any(const ConjugateCall<T>& call, int threads);
+template <class T>
+void adjoint_system_any(const AdjointSystemCall<T>& call, int threads);
+template <class T>
+void contact_gradients_any(const ContactGradientsCall<T>& call, int threads);
+template <class T>
+void adjoint_result_any(const AdjointResultCall<T>& call, int threads);
 template <class T>
 void pair_gradients_any(const PairGradientsCall<T>& call, int threads);
 

@@ -165,8 +165,8 @@ def test_the_result_for_a_time_is_watched_as_well(dtype: torch.dtype, monkeypatc
 
 def test_a_residual_of_nothing_is_no_error_of_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Rounding hides what is left there. The nearest trial beyond the bound has no residual, a further one has."""
-    monkeypatch.setattr(tuning._Study, "roundings", [0.0, 0.0])
-    study = object.__new__(tuning._Study)
+    monkeypatch.setattr(tuning.Study, "roundings", [0.0, 0.0])
+    study = object.__new__(tuning.Study)
     solver = pd.Chebyshev()
     chosen = Trial(solver, 20, 4.0, (0.0, 1.0), (3.0, 4.0))
     silent = Trial(solver, 10, 12.0, (0.0, 0.0), (12.0, 11.0))

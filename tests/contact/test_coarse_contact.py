@@ -78,3 +78,15 @@ def test_a_tower_of_stiff_cubes_settles() -> None:
         runs.append(torch.stack([state.positions[0] for state, _ in course.steps(sim, 20)]))
     middles = [run.reshape(20, 5, -1, 3).mean(dim=2) for run in runs]
     assert float((middles[0] - middles[1]).norm(dim=2).max()) < 5e-4
+
+
+def test_corrections_do_not_swing() -> None:
+    """A light cloth falls over a ball: a correction every eighth iteration would throw it back for ever, residual 1."""
+    mesh = pd.shapes.sheet((0.4, 0.4), (16, 16)).translated((0.0, 0.13, 0.0))
+    sheet = pd.Cloth(mesh, 1e5, 1e-3, 0.2, bending=1e-5)
+    contact = pd.Contact(friction=0.3, thickness=2e-3)
+    sim = simulator(pd.Scene(sheet, pd.Collider(pd.shapes.sphere(0.1)), contact, gravity()), 512, dtype=torch.float32)
+    course = Course(sim.scene)
+    *_, (_, info) = course.steps(sim, 13)
+    assert float(info.residual) < 1e-2
+    assert float(info.contact_gap) == pytest.approx(1.0, abs=1e-3)

@@ -47,6 +47,32 @@ def test_bits_without_contact(dtype: torch.dtype, batch: int) -> None:
         assert (state.history.keys == -1).all()
 
 
+@pytest.mark.parametrize("ground", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bits_of_the_steps_with_contact(dtype: torch.dtype, ground: bool) -> None:
+    """A history with a force asks for a step with contact: where it finds no pair it has the bits of the plain step.
+
+    The force is that of a pair within a body, which is not near: it is dropped, and takes no body's guess back.
+    """
+    parts = (*BODIES, gravity(), *([pd.Ground(-0.06)] * ground))
+    met = pd.Simulator(pd.Scene(*parts, pd.Contact(thickness=THICKNESS)), H, 24, dtype=dtype, progress=False)
+    alone = pd.Simulator(pd.Scene(*parts), H, 24, dtype=dtype, progress=False)
+    plan = contact_plan(met.scene.values())
+    vertex = int(plan.triangles[0, 0])
+    other = next(n for n, of in enumerate(plan.triangles) if plan.body[of[0]] == plan.body[vertex] and vertex not in of)
+    state: Any = met.rest_state()
+    state.velocities[:] = spinning(met)
+    plain = pd.State(state.positions.clone(), state.velocities.clone())
+    for _ in range(4):
+        state.history.keys[:, 0] = vertex * len(plan.triangles) + other
+        state.history.forces[:, 0, 0] = 1.0
+        state, info = met(state, return_info=True)
+        plain = alone(plain)
+        assert torch.isinf(info.contact_gap).all()
+        assert torch.equal(state.positions, plain.positions)
+        assert torch.equal(state.velocities, plain.velocities)
+
+
 def test_neighbours_in_contact_change_no_bits() -> None:
     """Of 12 environments every third has cubes that meet within the steps; each has the bits that it has alone."""
     met, alone = simulators()

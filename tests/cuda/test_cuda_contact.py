@@ -14,7 +14,9 @@ from body_scenes import (
     Course,
     G,
     ball_on_sheet,
+    block,
     crossed,
+    each,
     folded_sheet,
     gripper,
     plates,
@@ -55,13 +57,13 @@ def on_gpu(course: Course, iterations: int, dtype: torch.dtype = torch.float64, 
 
 
 @pytest.mark.parametrize("iterations", [4, 16, 64])
-def test_a_step_equals_that_of_the_cpu(iterations: int) -> None:
+@pytest.mark.parametrize("name", ["pressed cubes", *_COURSES])
+def test_a_step_equals_that_of_the_cpu(name: str, iterations: int) -> None:
     """Each step from the state of the CPU: the same pairs, places to 1e-9 of the longest way, forces to 1e-6.
 
-    Only sums over elements and energies have another order. Pins hold both bodies: those that are free have a coarse
-    correction in contact on the CPU alone. No two distances are equal, since rounding would decide between them.
+    Only sums over elements, energies and bodies have another order.
     """
-    course = pressed_cubes()
+    course = pressed_cubes() if name == "pressed cubes" else _COURSES[name][0]()
     host, device = simulator(course.scene, iterations), on_gpu(course, iterations)
     before = course.start(host)
     for number, (state, info) in enumerate(course.steps(host, 12)):
@@ -79,6 +81,41 @@ def test_a_step_equals_that_of_the_cpu(iterations: int) -> None:
         assert normal == pytest.approx(theirs, rel=1e-6, abs=1e-6 * most)
         before = state
     assert bool(before.history.forces.any())
+
+
+@pytest.mark.parametrize("iterations", [4, 16])
+def test_bodies_that_meet_keep_their_momentum(iterations: int, dtype: torch.dtype) -> None:
+    """The coarse correction leaves sum m v to rounding, however few the iterations."""
+    bodies = [
+        pd.Solid(block(0.1, 2, middle).mesh, youngs=1e5, density=1000.0) for middle in ((0.0,) * 3, (0.12, 0.02, 0.013))
+    ]
+    scene = pd.Scene(*bodies, pd.Contact(friction=0.5, thickness=THICKNESS))
+    sim = simulator(scene, iterations, dtype=dtype, device=GPU)
+    state: Any = sim.rest_state(2)
+    state.velocities[:] = torch.tensor(each(scene, (1.0, 0.2, 0.0), (-1.0, 0.0, 0.0))).to(state.velocities)
+    masses, first = sim.masses.double()[:, None], state.velocities.double()
+    for _ in range(4):
+        state = sim(state)
+        change = (masses * (state.velocities.double() - first)).sum(dim=1)
+        size = (masses * first.abs()).sum()
+        assert float(change.abs().max() / size) <= (1e-12 if dtype == torch.float64 else 1e-5)
+    assert float((state.velocities.double() - first).abs().max()) > 0.1
+
+
+@pytest.mark.parametrize("batch", [1, 300])
+def test_bits_without_contact(batch: int, dtype: torch.dtype) -> None:
+    """Steps in which nothing meets are those of kernel `stream` without Contact."""
+    bodies = block(0.1, 2, (0.0, 0.0, 0.0)), block(0.1, 2, (0.3, 0.0, 0.0))
+    met = simulator(pd.Scene(*bodies, pd.Gravity(), pd.Contact(thickness=THICKNESS)), 24, dtype=dtype, device=GPU)
+    alone = simulator(pd.Scene(*bodies, pd.Gravity()), 24, dtype=dtype, device=GPU, kernel="stream")
+    state: Any = met.rest_state(batch)
+    state.velocities.add_(noise(state.velocities))
+    plain = pd.State(state.positions.clone(), state.velocities.clone())
+    for _ in range(3):
+        state, plain = met(state), alone(plain)
+        assert torch.equal(state.positions, plain.positions)
+        assert torch.equal(state.velocities, plain.velocities)
+    assert (state.history.keys == -1).all()
 
 
 @pytest.mark.parametrize("iterations", [4, 16, 64])

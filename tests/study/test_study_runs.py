@@ -52,7 +52,7 @@ def test_files_and_their_schema(quick: tuple[Path, str]) -> None:
     assert {row.axis for row in rows} == set(AXES)
     assert [row.iterations for row in rows if row.axis == "stiffness" and row.youngs == 1e4][:3] == [1, 2, 3]
     assert record["rows"][0]["error"] == rows[0].error
-    for name in ("solver", "stiffness", "cost", "axes", "trajectory"):
+    for name in ("solver", "stiffness", "cost", "axes", "trajectory", "contact"):
         picture = np.asarray(Image.open(out / f"{name}.png").convert("RGB"))
         # mostly paper, but curves over its whole width: no collapsed panel
         inked = (picture.min(axis=2) < 200).any(axis=0)
@@ -91,7 +91,7 @@ def test_report_opens_in_a_browser(quick: tuple[Path, str]) -> None:
     ended = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
     assert "<title>What accuracy costs: beam</title>" in ended.stdout
     # plotly turns a div into a plot, with a line for every trace
-    assert len(re.findall(r'id="figure-\d+" class="[^"]*js-plotly-plot', ended.stdout)) == 7
+    assert len(re.findall(r'id="figure-\d+" class="[^"]*js-plotly-plot', ended.stdout)) == 8
     assert len(re.findall(r'class="trace scatter', ended.stdout)) > 30
     assert [line for line in ended.stderr.splitlines() if "CONSOLE" in line] == []
     text = (out / "report.html").read_text(encoding="utf-8")

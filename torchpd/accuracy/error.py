@@ -291,7 +291,12 @@ def exact_steps(
 
 @torch.no_grad()
 def settled_steps(
-    sim: Stepper, state: State | HistoryState, *, forces: Tensor | None = None, enough: float = _SURE
+    sim: Stepper,
+    state: State | HistoryState,
+    *,
+    forces: Tensor | None = None,
+    targets: Targets | None = None,
+    enough: float = _SURE,
 ) -> list[ExactStep]:
     """The step of every environment with its friction, if iterations from "velocity" settle.
 
@@ -305,6 +310,7 @@ def settled_steps(
         sim: scene, time step and material; its solver and device do not matter.
         state: start of the steps [B, V, 3].
         forces: [B, V, 3] N.
+        targets: as in `Simulator.forward`.
         enough: uncertainty at which to stop.
     """
     with torch.device("cpu"):
@@ -312,12 +318,13 @@ def settled_steps(
         twin.solver, twin.tolerance = Chebyshev(), 0.0
         twin = twin.to("cpu", torch.float64)
         wide, pushed = _wide_state(state), None if forces is None else _wide(forces)
+        placed = _wide(targets) if isinstance(targets, Tensor) else _widened(targets)
 
         def run(solver: Solver, iterations: int, start: str | Tensor = "velocity") -> State | HistoryState:
             twin.solver, twin.iterations = solver, iterations
-            return twin(wide, pushed, start=start)
+            return twin(wide, pushed, placed, start)
 
-        problems = [problem_of(sim, state, item, forces=forces) for item in range(len(wide.positions))]
+        problems = [problem_of(sim, state, item, forces=forces, targets=targets) for item in range(len(wide.positions))]
         first = torch.from_numpy(np.stack([problem.unsolved() for problem in problems]))
         anew = sim.scene.contact is not None  # whose steps take no positions to start from
         after = run(Chebyshev() if anew else Multilevel(), _LEADING)

@@ -167,7 +167,8 @@ class RigidMotions(Motions):
     @cached_property
     def hessian(self) -> Array:
         """Second derivative [N, N] by the twists: exact where it is positive definite, else without curvature."""
-        hessian = np.einsum("vin,v,vik->nk", self.modes, self.problem.weight[self.vertices], self.modes, optimize=True)
+        flat = self.modes.reshape(-1, self.modes.shape[2])
+        hessian = flat.T @ (np.repeat(self.problem.weight[self.vertices], 3)[:, None] * flat)
         for _, arms, basis, rows, columns in self.parts:
             exact = hessian[columns, columns] + basis.T @ _curvature(self.pull[rows], arms) @ basis
             if basis.shape[1] and np.linalg.eigvalsh(exact)[0] > 0.0:
@@ -341,9 +342,10 @@ def _correct_island(
 def _newton_terms(motions: Motions, contacts: Envelopes, radius: Array) -> tuple[Array, Array]:
     """The second derivative [N, N] of Phi by the motions, and minus the first [N]."""
     jacobian, second = motions.jacobian(contacts), contacts.majoriser(radius)
-    on = second.any(axis=(1, 2))
-    matrix = motions.hessian + np.einsum("min,mij,mjk->nk", jacobian[on], second[on], jacobian[on], optimize=True)
-    return matrix, np.einsum("min,mi->n", jacobian, contacts.forces(radius)) - motions.gradient
+    on, columns = second.any(axis=(1, 2)), jacobian.shape[2]
+    flat = jacobian[on].reshape(-1, columns)
+    matrix = motions.hessian + flat.T @ (second[on] @ jacobian[on]).reshape(-1, columns)
+    return matrix, contacts.forces(radius).reshape(-1) @ jacobian.reshape(-1, columns) - motions.gradient
 
 
 def _pushed(motions: Motions, contacts: Envelopes, radius: Array, push_pairs: bool) -> tuple[Array, Array]:

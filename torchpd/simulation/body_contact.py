@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from ..ops.fake_kernels import CONTACT_FRICTION
+from ..plan.contact_clusters import contact_clusters
 from ..plan.contact_plan import ContactPlan, contact_plan
 from ..plan.contact_start import check_start
+from ..plan.contact_tree import FAN_OUT
 from ..scene.contact import placed
 from ..scene.scene import SceneValues
 from .pair_forces import ContactSurfaces
@@ -166,11 +168,16 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     def real(array: Any) -> Tensor:
         return torch.tensor(np.asarray(array), dtype=dtype)
 
-    sizes = whole([len(plan.self_contact), len(plan.poses), plan.capacity])
+    bodies = len(plan.self_contact)
+    trees = [plan.vertex_tree, plan.edge_tree, plan.triangle_tree]
+    clusters = contact_clusters(trees, [plan.vertices[:, None], plan.edges, plan.triangles], plan.body)
+    # vertices, and those of surfaces, lie body by body
+    starts = [np.searchsorted(of, np.arange(bodies + 1)) for of in (plan.body, plan.body[plan.vertices])]
+    sizes = whole([bodies, len(plan.poses), plan.capacity, *clusters.counts])
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
-    trees = [plan.vertex_tree.order, plan.triangle_tree.order, plan.edge_tree.order]
+    search = [clusters.leaves.reshape(-1, FAN_OUT), clusters.body, np.stack(starts)]
     rest = [plan.near.thickness, plan.shape, plan.apart]
     reals = [*rest, plan.points.reshape(-1, 3), plan.cell, plan.friction]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
-    moved = [array.to(device) for array in (*map(whole, [*surfaces, *trees]), keys, *map(real, reals))]
+    moved = [array.to(device) for array in (*map(whole, [*surfaces, *search]), keys, *map(real, reals))]
     return [sizes, *moved, real([plan.thickness])]

@@ -9,20 +9,20 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from ..common.checks import check_whole
 from ..common.synonyms import check_arguments
 from ..estimate.solver_choice import Choice
 from ..ops.diagonal import named_material
 from ..plan.compiled import persistent_tensors
 from ..plan.cpu_plan import Plan, compile_plan
 from ..plan.kernel_choice import check_kernel
-from ..plan.material import CORE_ROWS, HISTORY_PLACES, material_of, ops_names, with_absent
+from ..plan.material import HISTORY_PLACES, material_of, ops_names
 from ..plan.mutation_guard import MutationGuard, check_rest
-from ..plan.placement import check_target_device, is_recording
-from ..scene.pins import PIN_HARD, hold_exactly
+from ..plan.placement import check_target_device
+from ..scene.pins import PIN_HARD
 from ..scene.scene import Scene
-from ..scene.solvers import DEFAULT_ITERATIONS, LARGEST_COUNT, Chebyshev, Solver, SolverName, check_solver
+from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Solver, SolverName, check_solver
 from ..scene.targets import Anchors, Targets
+from .configured import Configured
 from .load_checks import warn_of_loads
 from .material_update import (
     check_change,
@@ -33,19 +33,12 @@ from .material_update import (
     write_change,
 )
 from .notices import Notices, warn_of_scene
-from .pin_mask import PinMask, held_springs, read_pin_mask, serves_any_mask
 from .settings import (
-    EVERY_STEP,
-    NO_STEP,
-    SETTINGS,
-    Configuration,
     check_contact,
-    check_iterations,
     choose,
     choose_again,
     is_auto,
     moved,
-    prepare,
     reconfigure,
 )
 from .state import ContactHistory, History, HistoryState, State, history_of
@@ -54,7 +47,6 @@ from .state_checks import (
     check_batch,
     check_state,
     check_time_step,
-    check_tolerance,
     positions_of,
     report_resolution,
 )
@@ -63,11 +55,9 @@ from .surface_loads import SurfaceLoads
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from .body_contact import BodyContact
 
 __all__ = ["Model"]
 
-_PIN_STIFFNESS = CORE_ROWS.index("pin_stiffness")
 _FLOW_WIDTH = 10  # of `History.flow`
 
 
@@ -77,7 +67,7 @@ class _TuningResult(Protocol):
     def invalidate(self, other: bool) -> None: ...
 
 
-class Model(nn.Module):
+class Model(Configured):
     """Plan, settings and material of a `Simulator`, which documents the arguments, and their changes."""
 
     rest_positions: Tensor
@@ -86,7 +76,6 @@ class Model(nn.Module):
     gravity: Tensor
     damping: Tensor
     pin_stiffness: Tensor
-    pin_hard: Tensor
     pin_targets: Tensor
     planes: Tensor
     spheres: Tensor
@@ -95,8 +84,6 @@ class Model(nn.Module):
     wind: Tensor
     material_names: tuple[str, ...]  # trainable arrays of the scene, in the order of the tables
     loads: SurfaceLoads | None  # None without pressure or wind
-    body_contact: BodyContact | None = None  # None without `Contact`
-    progress: bool = True  # whether bars show while a large scene compiles, for another device too
 
     @check_arguments("Simulator")
     def __init__(
@@ -168,205 +155,6 @@ class Model(nn.Module):
             self.solver = given
             self.named_iterations = iterations is not None
             self.check_iterations(None)
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices of all bodies."""
-        return self.plan.vertices
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of states."""
-        return self.plan.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Device of plan and states."""
-        return self.plan.device
-
-    @property
-    def batch(self) -> int | None:
-        """Expected environments of a step, or None; setting it replans a GPU and lets "auto" choose again."""
-        return self._batch
-
-    @batch.setter
-    def batch(self, batch: int | None) -> None:
-        self._reconfigure(batch=batch)
-
-    @property
-    def kernel(self) -> str:
-        """Requested kernel of a GPU; setting it replans a GPU and lets "auto" choose again."""
-        return self._kernel
-
-    @kernel.setter
-    def kernel(self, kernel: str) -> None:
-        self._reconfigure(kernel=kernel)
-
-    @property
-    def time_step(self) -> float:
-        """h [s]; setting it may give an `UnsolvedWarning`, as `set_material` does."""
-        return self._time_step
-
-    @time_step.setter
-    def time_step(self, time_step: float) -> None:
-        self._time_step = check_time_step(time_step, self.dtype)
-        shortest, longest = self._checked_time_steps
-        # a time step that changes in every step is rarely outside of the checked range
-        if not (shortest <= self._time_step <= longest or is_recording(self.device)):
-            self.check_iterations("time_step")
-
-    @property
-    def iterations(self) -> int:
-        """Most local and global steps in a time step."""
-        return self._iterations
-
-    @iterations.setter
-    def iterations(self, iterations: int) -> None:
-        self._iterations = check_whole("Simulator: iterations", iterations, minimum=0, maximum=LARGEST_COUNT)
-        self.named_iterations = True
-
-    @property
-    def named_iterations(self) -> bool:
-        """Whether the user gave the number of iterations: then no warning says that it has become too small."""
-        return self._named_iterations
-
-    @named_iterations.setter
-    def named_iterations(self, named: bool) -> None:
-        self._named_iterations = named
-        self._checked_time_steps = EVERY_STEP if named else NO_STEP
-
-    def check_iterations(self, changed: str | None) -> None:
-        """Warn once if default iterations are too few after a change of `changed`; waits for a GPU until then."""
-        if self._checked_time_steps != EVERY_STEP:
-            now = self.compiled
-            self._checked_time_steps = EVERY_STEP  # also if the warning is raised as an error
-            self._checked_time_steps = check_iterations(now, changed).checked_time_steps
-
-    @property
-    def tolerance(self) -> float:
-        """Estimated relative displacement error below which an environment stops iterating; 0: never."""
-        return self._tolerance
-
-    @tolerance.setter
-    def tolerance(self, tolerance: float) -> None:
-        self._tolerance = check_tolerance(tolerance)
-
-    @property
-    def solver(self) -> Solver:
-        """The solver. Setting `Multilevel` prepares its matrix; "auto" sets iterations too."""
-        return self._solver
-
-    @solver.setter
-    def solver(self, solver: Solver | SolverName) -> None:
-        self._reconfigure(solver=solver)
-
-    @property
-    def adjoint(self) -> str:
-        """Preconditioner of gradients, "solver" or "multilevel"; setting "multilevel" prepares its matrix."""
-        return self._adjoint
-
-    @adjoint.setter
-    def adjoint(self, adjoint: str) -> None:
-        self._reconfigure(adjoint=adjoint)
-
-    @property
-    def contact_friction(self) -> Tensor:
-        """Coulomb's coefficient between bodies of `Contact` [Q, Q]: those of the scene in its order, then colliders.
-
-        Set a number, or a symmetric table; gradients of later steps flow to what was set. A table of its own for each
-        environment is not provided.
-
-        Example:
-            >>> friction = torch.tensor(0.3, requires_grad=True)
-            >>> sim.contact_friction = friction
-            >>> sim(state).positions.sum().backward()
-        """
-        return self._contact().friction
-
-    @contact_friction.setter
-    def contact_friction(self, friction: Tensor | float) -> None:
-        self.body_contact = self._contact().with_friction(friction)
-
-    def _contact(self) -> BodyContact:
-        if self.body_contact is None:
-            raise ValueError("contact_friction: the scene must have a Contact, got none; add Contact()")
-        return self.body_contact
-
-    @property
-    def compiled(self) -> Configuration:
-        """Plan, material and present settings, for modules below the simulator."""
-        return self._with_material(self.material())
-
-    def _with_material(self, material: list[Tensor]) -> Configuration:
-        own = {name: getattr(self, "_" + name) for name in SETTINGS}
-        kept = {name: getattr(self, name) for name in ("scene", "pinned", "plan", "choice", "progress")}
-        return Configuration(material=material, **kept, **own)
-
-    def _reconfigure(self, **changes: Any) -> None:
-        with persistent_tensors():
-            self._take(reconfigure(self.compiled, **changes))
-
-    def _take(self, new: Configuration) -> None:
-        """Take over plan and settings, all of them at once."""
-        own = {"_" + name: getattr(new, name) for name in SETTINGS}
-        vars(self).update(own, plan=new.plan, choice=new.choice)
-
-    def prepare_solver(self) -> None:
-        """Prepare the matrix of `Multilevel` or `adjoint` for the present material, and let "auto" choose again.
-
-        Call it after large changes of material or time_step, which `Info.rho`, `Info.residual` and, for "auto", an
-        `UnsolvedWarning` show. Then capture captured steps again; compiled steps recompile. It takes 0.3 s for 8
-        thousand vertices and seconds for a million tetrahedra. Other solvers prepare nothing.
-
-        `set_material` calls it only when it pins other vertices hard, frees some, or gives them much stiffer springs.
-        """
-        with persistent_tensors():
-            self._take(prepare(self.compiled))
-
-    def material(self) -> list[Tensor]:
-        """The differentiable arrays in the order of the ops, contiguous whatever a call or a parametrization gives.
-
-        Springs of hard pins are inf here. The plan follows when `pin_hard` releases pins.
-        """
-        arrays = self._own_arrays()
-        if self.anchors.pinned:
-            arrays[_PIN_STIFFNESS] = self._held_springs(arrays)
-        # is_contiguous() is far cheaper than contiguous(), which takes 6 of the 40 us of a tiny step
-        return [array if array.is_contiguous() else array.contiguous() for array in arrays]
-
-    def _own_arrays(self) -> list[Tensor]:
-        arrays = [getattr(self, name) for name in self._ops_names]
-        return arrays if len(arrays) == len(CORE_ROWS) else with_absent(arrays, self._ops_names)
-
-    def _held_springs(self, arrays: list[Tensor]) -> Tensor:
-        hard = self._buffers[PIN_HARD]  # nn.Module.__getattr__ would double the time of this method
-        assert hard is not None
-        if torch.compiler.is_compiling():
-            return hold_exactly(arrays[_PIN_STIFFNESS], hard)
-        guard = self._pin_guard
-        mask = guard.found if guard.is_current(hard) else self._read_pin_mask(arrays, hard)
-        return held_springs(mask, arrays[_PIN_STIFFNESS], hard)
-
-    def _read_pin_mask(self, arrays: list[Tensor], hard: Tensor, *, wait: bool = False) -> PinMask:
-        """Let the plan follow a mask that releases pins the plan relies on.
-
-        A step reads the mask, and waits for a GPU, only after a write to it, and only if the plan relies on hard pins.
-        With `wait` it always does.
-        """
-        if not wait and serves_any_mask(self.plan):
-            return PinMask(some=True)
-        guard, self.plan = read_pin_mask(self._with_material(arrays), hard, wait=wait)
-        if guard.is_current(hard):
-            self._pin_guard = guard
-        mask: PinMask = guard.found
-        return mask
-
-    def _refresh_pin_mask(self) -> None:
-        """Read the pins after they were set or moved, so that later steps need not wait for a GPU."""
-        self._pin_guard = MutationGuard()
-        if self.anchors.pinned:
-            with persistent_tensors():
-                self._read_pin_mask(self._own_arrays(), self.pin_hard, wait=True)
 
     def __copy__(self) -> Self:
         """A shallow copy; torch refuses to copy parametrized modules through pickling."""
@@ -483,17 +271,6 @@ class Model(nn.Module):
         if guard is not self._rest_guard:
             self._rest_guard = guard
         return rest
-
-    def step_settings(self, *, inertial: bool, report: bool) -> dict[str, Any]:
-        """The settings as keyword arguments of the ops."""
-        return {
-            **self.solver.settings(),
-            "iterations": self.iterations,
-            "time_step": self.time_step,
-            "tolerance": self.tolerance,
-            "inertial": inertial,
-            "report": report,
-        }
 
     def material_at(self, targets: Targets | None, batch: int, *, fix: str = "") -> list[Tensor]:
         """The material with pins, spheres and fibres as `targets` say; `fix` ends errors about another shape."""

@@ -14,6 +14,7 @@ from ..accuracy.candidates import DEFAULT
 from .results_log import Row
 
 __all__ = [
+    "PALETTE",
     "SLOPES",
     "STYLES",
     "TOP",
@@ -61,6 +62,7 @@ _REPEATED = ("damped Jacobi",)
 
 
 # the theoretical slope of an axis: the power, and its name
+PALETTE = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#e69f00")  # of scenes, in turn
 SLOPES = {"time step": (1.0, "order one in h"), "mesh": (-2.0 / 3.0, "order two in the edge")}
 
 
@@ -104,6 +106,7 @@ def draw_study(rows: list[Row], out: Path, *, scene_name: str) -> list[Path]:
         "cost.png": (("stiffness",), _draw_cost),
         "axes.png": (("time step", "mesh", "float"), _draw_axes),
         "trajectory.png": (("trajectory",), _draw_trajectory),
+        "contact.png": (("contact",), _draw_contact),
     }
     written = []
     for name, (axes, draw) in drawers.items():
@@ -429,5 +432,37 @@ def _draw_trajectory(rows: list[Row], path: Path, scene_name: str) -> Path:
         axis.annotate(
             "default ", (64, 0.25), xycoords=("data", "axes fraction"), va="bottom", ha="right", fontsize=9, color=_INK
         )
+    figure.savefig(path)
+    return path
+
+
+# ---- bodies that meet
+
+
+def _draw_contact(rows: list[Row], path: Path, _: str) -> Path:
+    """Error of a step against its time, what it leaves of the momentum, and the path of a motion, scene by scene."""
+    figure, axes = _figure(
+        3, "bodies that meet: one step, and a second of motion, float32; stars: the default", width=5.6
+    )
+    curves = curves_of(rows, lambda row: row.method)
+    panels: list[tuple[str, str, Callable[[Row], Any], Callable[[Row], float]]] = [
+        ("milliseconds", axis_label("error"), lambda row: row.milliseconds, lambda row: row.error),
+        ("iterations", "momentum that no force explains, a share", lambda row: row.iterations,
+         lambda row: row.more["momentum"]),
+        ("iterations", "largest distance from the converged motion,\nover the displacement", lambda row: row.iterations,
+         lambda row: row.more["path"]),
+    ]  # fmt: skip
+    for axis, (name, label, across, down) in zip(axes, panels, strict=True):
+        for color, (scene, own) in zip(itertools.cycle(PALETTE), curves.items(), strict=False):
+            values = [min(max(down(row), _LOWEST), TOP) for row in own]
+            axis.plot([across(row) for row in own], values, color=color, linewidth=2.0, label=scene)
+            stars = [(across(row), value) for row, value in zip(own, values, strict=True) if row.default]
+            if stars:
+                axis.plot(*zip(*stars, strict=True), "*", color=color, markersize=15, markeredgecolor="white", zorder=6)
+        axis.set_xscale("log")
+        axis.set_xlabel(axis_label(name))
+        _error_axis(axis, [down(row) for row in rows], label)
+    axes[0].legend(frameon=False, fontsize=9, loc="lower left")
+    _note_uncertain(figure, rows)
     figure.savefig(path)
     return path

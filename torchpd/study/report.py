@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from ..common.checks import optional_module
-from .plots import SLOPES, STYLES, TOP, axis_label, curves_of, method_label, pareto_front
+from .plots import PALETTE, SLOPES, STYLES, TOP, axis_label, curves_of, method_label, pareto_front
 from .results_log import Row
 
 __all__ = ["write_report"]
@@ -147,7 +148,22 @@ def _figures(rows: list[Row]) -> list[Figure]:
     for axis, title, place, label in others:
         if axis in by_axis:
             found.append((title, words[axis], _plain_figure(by_axis[axis], place, label, SLOPES.get(axis))))
+    if "contact" in by_axis:
+        words["contact"] = (
+            "One step against its converged one, with friction. Hover for the gap, the momentum that no force "
+            "explains, and the distance from the converged motion of a second."
+        )
+        found.append(("Bodies that meet", words["contact"], _contact_figure(by_axis["contact"])))
     return found
+
+
+def _contact_figure(rows: list[Row]) -> Any:
+    import plotly.graph_objects as go
+
+    figure = go.Figure()
+    for color, (name, own) in zip(itertools.cycle(PALETTE), curves_of(rows, lambda r: r.method).items(), strict=False):
+        figure.add_trace(_trace(own, lambda row: row.milliseconds, name, (color, 2.0, "solid")))
+    return _layout(figure, axis_label("milliseconds"), rows)
 
 
 def _layout(figure: Any, label: str, rows: list[Row]) -> Any:

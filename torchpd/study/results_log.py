@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 class Row:
     """One point of a study. Numbers that do not apply are None; the error of a failure is inf."""
 
-    axis: str  # the error studied: "solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper"
+    axis: str  # the error studied: "solver", "stiffness", "float", "time step", "mesh", "trajectory", "contact", ...
     method: str
     status: str = "ok"  # or "diverged", "uncertain", or "refused: " and the reason
     precision: str = "float64"

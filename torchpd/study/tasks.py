@@ -35,18 +35,30 @@ from .axes import (
     time_step_rows,
 )
 from .bench import Bench, Setting, clock_of, precision_name
+from .contact import CONTACT_SCENES, contact_rows
 from .results_log import ResultsLog, Row, write_csv
 from .scenes import StudyScene, study_scene
 from .trajectory import tolerance_rows, trajectory_rows
 
-__all__ = ["AXES", "SCHEMA", "StudyOptions", "cost_table", "paper_table", "run_study", "study_rows", "study_table"]
+__all__ = [
+    "AXES",
+    "SCHEMA",
+    "StudyOptions",
+    "contact_table",
+    "cost_table",
+    "paper_table",
+    "run_study",
+    "study_rows",
+    "study_table",
+]
 
 SCHEMA = 1
-AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "paper")
+AXES = ("solver", "stiffness", "float", "time step", "mesh", "trajectory", "contact", "paper")
 _PACKAGES = ("matplotlib", "plotly", "threadpoolctl")
 _STIFFNESS_FACTORS = (0.01, 0.1, 1.0)
 _STIFF, _STIFF_MOST = "Multilevel", 32  # the solver for stiff bodies, and its iteration limit there
 _TOLERANCES = [1e-2, 1e-3, 1e-4], 128  # tolerances of its steps elsewhere, and their iteration limit
+_CONTACT_MOST = 512  # iteration limit where bodies meet
 _LITERATURE_MOST = 256  # iteration limit of published methods
 
 Task = Callable[[], list[Row]]
@@ -151,6 +163,9 @@ def _tasks(bench: Bench, options: StudyOptions) -> dict[str, Task]:
             tasks[key] = partial(trajectory_rows, bench, softer, own, seconds=seconds, name=name)
         key = f"trajectory: {_STIFF}, tolerance, {softer.youngs:g} Pa"
         tasks[key] = partial(tolerance_rows, bench, softer, *_TOLERANCES, seconds=seconds, name=_STIFF)
+    for name in list(CONTACT_SCENES)[:2] if options.quick else CONTACT_SCENES:
+        own = [count for count in counts if 4 <= count <= _CONTACT_MOST]
+        tasks[f"contact: {name}"] = partial(contact_rows, bench, name, own, **({"steps": 4} if options.quick else {}))
     tasks["paper: table"] = partial(paper_rows, bench)
     return {key: task for key, task in tasks.items() if key.split(":")[0] in options.axes}
 
@@ -202,7 +217,7 @@ def run_study(options: StudyOptions, *, progress: bool = True) -> str:
     written.append(write_csv(rows, options.out / "study.csv"))
     written += draw_study(rows, options.out, scene_name=record["subject"])
     written.append(write_report(rows, record, options.out / "report.html"))
-    tables = [table for table in (study_table(rows), cost_table(rows), paper_table(rows)) if table]
+    tables = [table for table in (study_table(rows), cost_table(rows), contact_table(rows), paper_table(rows)) if table]
     return "\n".join(["\n\n".join(tables), "", "written:", *(f"  {file}" for file in written)])
 
 
@@ -283,6 +298,30 @@ def cost_table(rows: list[Row]) -> str:
             line += f"{default[0]:>18}{path:>14}"
         lines.append(line)
     return "\n".join(lines) if own else ""
+
+
+def contact_table(rows: list[Row]) -> str:
+    """Table of the scenes in which bodies meet: the cost of an error of a step, and what the default leaves.
+
+    gap: least distance over the thickness. momentum: share that no force explains. path: largest distance from the
+    converged motion over the largest displacement.
+    """
+    own = [row for row in rows if row.axis == "contact"]
+    lines = [
+        f"{'bodies that meet':<26}"
+        + "".join(f"{f'to {goal:.0e}':>22}" for goal in _GOALS)
+        + f"{'default: error':>18}{'gap':>8}{'momentum':>11}{'its path':>11}"
+    ]
+    for name in dict.fromkeys(row.method for row in own):
+        at = [row for row in own if row.method == name]
+        ends = [
+            f"{row.error:>18.1e}{row.more['gap']:>8.2f}{row.more['momentum']:>11.1e}{row.more['path']:>11.1e}"
+            for row in at
+            if row.default
+        ]
+        lines.append(f"{name:<26}{_costs(at)}{(ends or [''])[0]}")
+    crossed = sum(int(row.more["crosses"]) for row in own)
+    return "\n".join([*lines, f"steps with a crossing: {crossed} of {len(own)}"]) if own else ""
 
 
 def paper_table(rows: list[Row]) -> str:

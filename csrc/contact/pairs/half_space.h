@@ -43,7 +43,9 @@ PD_HD T place_rounding(const Vec3<T>& x) {
 template <class T>
 PD_HD bool move_into(const Ball<T>& ball, Vec3<T>& place) {
   const Vec3<T> arm = place - ball.center;
-  const T length = square_root(dot(arm, arm));
+  const T square = dot(arm, arm);
+  if (square <= ball.radius * ball.radius) return false;
+  const T length = square_root(square);
   const bool outside = length > ball.radius * T(1.0 + ball_tolerance);
   if (outside) place = multiply_add(ball.radius / length, arm, ball.center);
   return outside;

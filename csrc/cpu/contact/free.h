@@ -5,8 +5,8 @@
 // before such a step, to save it, and its end after it. Whatever fails takes the step again, with contact.
 #pragma once
 #include "contact/pairs/shares.h"
-#include "cpu/contact/shape.h"
-#include "cpu/contact/tree.h"
+#include "solver/contact/serial_team.h"
+#include "solver/contact/shape.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -37,7 +37,7 @@ class FreeMotion {
     places_.resize(plan_.vertices);
     place(call_.out_positions, goal, environment);
     for (int b = 0; b < plan_.bodies; ++b) {
-      shapes_.each_of(b, [&](int v) {
+      each_of(b, [&](int v) {
         // a helix leaves the box of its ends by half a chord at most
         const Vec3<T> chord = places_[v] - begin_[v];
         const T bow = v < plan_.body_vertices ? T(0) : T(0.5) * square_root(dot(chord, chord));
@@ -65,6 +65,18 @@ class FreeMotion {
   }
 
  private:
+  template <class Visit>
+  void each_of(int body, const Visit& visit) const {
+    for (int n = plan_.surface_start[body]; n < plan_.surface_start[body + 1]; ++n)
+      visit(plan_.point[n]);
+  }
+  bool has_surface(int body) const {
+    return plan_.surface_start[body] < plan_.surface_start[body + 1];
+  }
+  bool moves_by_hand(int body) const {
+    return !has_surface(body) || plan_.body_start[body] >= plan_.body_vertices;
+  }
+
   T margin() const { return T(0.5 + slack_share) * plan_.thickness; }
 
   void place(const T* positions, const T* poses, std::int64_t environment) {
@@ -78,18 +90,18 @@ class FreeMotion {
     place(call_.positions, contact_.history.poses + 7 * environment * plan_.colliders, environment);
     for (int b = 0; b < plan_.bodies; ++b) {
       boxes_[b] = Box<T>::none();
-      shapes_.each_of(b, [&](int v) { boxes_[b].add(places_[v]); });
+      each_of(b, [&](int v) { boxes_[b].add(places_[v]); });
       boxes_[b] = boxes_[b].widened(margin());
     }
   }
 
   bool are_apart() const {
     for (int a = 0; a < plan_.bodies; ++a) {
-      if (plan_.touches_itself[a] && shapes_.has_surface(a) &&
-          !(shapes_.apart(a, places_) > T(1.0 + slack_share) * plan_.thickness))
+      if (plan_.touches_itself[a] && has_surface(a) &&
+          !(shapes_.apart(SerialTeam(), a, places_.data()) > T(1.0 + slack_share) * plan_.thickness))
         return false;
       for (int b = a + 1; b < plan_.bodies; ++b) {
-        const bool held = shapes_.moves_by_hand(a) && shapes_.moves_by_hand(b);
+        const bool held = moves_by_hand(a) && moves_by_hand(b);
         if (!held && boxes_[a].meets(boxes_[b])) return false;
       }
     }

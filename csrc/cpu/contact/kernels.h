@@ -31,16 +31,10 @@ template <class T>
 struct ContactWork {
   Workspace<Single<T>> work;
   Scratch<Single<T>> scratch;
-  ContactRun<T> run;
-  Approach<T> approach;
-  CoarseContact<T> coarse;
+  ContactMemory<T> memory;
 
   ContactWork(const StepCall<T>& call, const ContactPlan<T>& plan)
-      : work(call),
-        scratch(call.plan.most_slots),
-        run(plan),
-        approach(plan),
-        coarse(plan, call.plan) {}
+      : work(call), scratch(call.plan.most_slots), memory(call, plan) {}
 };
 
 template <bool HasContacts, class T>
@@ -49,8 +43,8 @@ void contact_step_with(const StepCall<T>& call, const ContactCall<T>& contact,
   each_environment(
       list, threads, [&] { return ContactWork<T>(call, contact.plan); },
       [&](ContactWork<T>& own, std::int64_t e, const Team& alone) {
-        ContactStepper<T, HasContacts>(call, own.work, own.scratch, alone, e, contact, own.run,
-                                       own.approach, own.coarse)
+        ContactStepper<T, HasContacts>(call, own.work, own.scratch, alone, e, contact,
+                                       own.memory)
             .rollout();
       });
 }

@@ -1,6 +1,7 @@
 // How the coarse space of solver/multilevel/pieces.h acts on vectors, on the CPU.
 #pragma once
 #include "cpu/multilevel/pieces_build.h"
+#include "cpu/multilevel/v_cycle.h"
 
 namespace pd::inline PD_TARGET {
 

@@ -9,6 +9,8 @@
 #include "elements/solid.h"
 #include "threads/team.h"
 
+#include <vector>
+
 namespace pd::inline PD_TARGET {
 
 // Positions, directions and forces of the slots of one patch, one per thread.
@@ -26,6 +28,13 @@ struct Scratch {
  private:
   Storage storage_;
 };
+
+template <class Lanes, class T>
+std::vector<Scratch<Lanes>> make_scratches(const Plan<T>& plan, int threads) {
+  std::vector<Scratch<Lanes>> scratches;
+  for (int i = 0; i < threads; ++i) scratches.emplace_back(plan.most_slots);
+  return scratches;
+}
 
 // Sums over the visits of one part; components are added up at its end.
 template <class Lanes>

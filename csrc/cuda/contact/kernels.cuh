@@ -5,6 +5,7 @@
 #include "cuda/common/teams.cuh"
 #include "cuda/contact/launch.h"
 #include "cuda/contact/team.cuh"
+#include "cuda/rigid/contact_forces.h"
 #include "solver/contact/step.h"
 #include "views/arena.h"
 
@@ -30,7 +31,7 @@ template <class T>
 struct ContactKernel {
   ContactWork<T> work;
   ContactMemory<T> memory;
-  int chunks, teams, blocks, k;
+  int chunks, teams, blocks, k, trial;
 };
 
 template <class T>
@@ -44,7 +45,7 @@ int count_chunks(const ContactWork<T>& work) {
 template <class T>
 std::int64_t arrange(const ContactWork<T>& work, void* base, ContactMemory<T>& m) {
   const auto each = [&](Arena& arena) {
-    arrange(arena, work.contact.plan, std::max(1, work.pieces), m.first);
+    arrange(arena, work.contact.plan, work.pieces, m.first);
   };
   Arena size(nullptr);
   each(size);
@@ -72,9 +73,9 @@ PD_DEVICE BodyState<T> body_state(const ContactKernel<T>& call, std::int64_t e) 
           w.x + at,
           u,
           before,
-          before,
           target,
           call.memory.saved + at,
+          before,
           u + 3,
           target + 3,
           w.material.masses.of(e),
@@ -131,6 +132,39 @@ PD_DEVICE void iterate(const ContactKernel<T>& call, const ContactSteps<T>& step
   }
 }
 
+// A coarse correction of bodies in contact: of environments that are done only at the end.
+template <class T>
+PD_DEVICE bool asks_correction(const ContactKernel<T>& call, const ContactNumbers& numbers,
+                               std::int64_t e) {
+  const bool last = call.k == 0 || call.k == call.work.settings.iterations;
+  return (last || !static_cast<const Progress*>(call.work.progress)[e].done) &&
+         (call.trial == 0 || numbers.cuts);
+}
+
+template <class T>
+PD_DEVICE void begin_correction(const ContactKernel<T>& call, const ContactSteps<T>& steps,
+                                const ContactTeam& team, ContactNumbers& numbers, std::int64_t e) {
+  if (asks_correction(call, numbers, e)) {
+    steps.begin_correction(team);
+  } else {
+    team.once([&] { numbers.corrects = 0; });
+  }
+}
+
+template <class T>
+PD_DEVICE void correct(const ContactKernel<T>& call, const ContactSteps<T>& steps,
+                       const ContactTeam& team, const ContactNumbers& numbers, std::int64_t e) {
+  if (!numbers.corrects) return;
+  const ContactWork<T>& w = call.work;
+  const int walls = w.material.planes_count + w.material.spheres_count;
+  auto* const first = reinterpret_cast<Quad<T>*>(w.wall_forces) + e * walls * w.vertices;
+  const auto forces = [&](int i) { return VertexForces<T>{first + i, w.vertices}; };
+  bool cuts = steps.correct(team, forces);
+  // planes and spheres ask for a pass over elements between trials
+  for (int n = 1; walls == 0 && cuts && n < coarse_trials && steps.begin_correction(team); ++n)
+    cuts = steps.correct(team, forces);
+}
+
 // Positions and velocities of an environment whose pairs exceed the capacity stay.
 template <class T>
 PD_DEVICE void take_back(const ContactWork<T>& w, const ContactTeam& team, std::int64_t e) {
@@ -172,6 +206,10 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
       }
     } else if constexpr (What == ContactTask::go_first) {
       steps.go_first(team);
+    } else if constexpr (What == ContactTask::begin_correction) {
+      begin_correction(call, steps, team, environment.numbers(), e);
+    } else if constexpr (What == ContactTask::correct) {
+      correct(call, steps, team, environment.numbers(), e);
     } else if constexpr (What == ContactTask::iterate) {
       iterate(call, steps, team, e, call.k, blocks.thread() == 0);
     } else if constexpr (What == ContactTask::go_last) {
@@ -183,7 +221,7 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
       const ContactHistory<T>& to = w.contact.history;
       steps.write(team, {to.next_poses + 7 * c, to.next_keys + m, to.next_forces + 4 * m,
                          w.contact.held_back + c, forces, w.contact.info + e * contact_info_count});
-      if (environment.numbers().most_pairs > plan.capacity) take_back(w, team, e);
+      if (steps.overflows()) take_back(w, team, e);
     }
     team.barrier();
   }
@@ -197,8 +235,8 @@ __global__ void contact_components(const __grid_constant__ ContactKernel<T> call
 }
 
 template <ContactTask What, class T>
-void launch_contact(const ContactWork<T>& work, int k, cudaStream_t stream) {
-  ContactKernel<T> call{work, {}, count_chunks(work), 0, 0, k};
+void launch_contact(const ContactWork<T>& work, int k, int trial, cudaStream_t stream) {
+  ContactKernel<T> call{work, {}, count_chunks(work), 0, 0, k, trial};
   arrange(work, work.memory, call.memory);
   const auto* kernel = reinterpret_cast<const void*>(contact_task<What, T>);
   const int resident = resident_blocks(kernel, contact_threads, 0);
@@ -227,7 +265,7 @@ std::int64_t contact_bytes(const ContactWork<T>& work) {
 template <class T>
 void prepare_contact(const ContactWork<T>& work, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
-  ContactKernel<T> call{work, {}, 0, 0, 0, 0};
+  ContactKernel<T> call{work, {}, 0, 0, 0, 0, 0};
   arrange(work, work.memory, call.memory);
   check(cudaMemsetAsync(call.memory.component, 0xff, work.vertices * sizeof(int), stream));
   if (work.pieces == 0 || work.slots == 0) return;
@@ -244,21 +282,21 @@ void keep_displacements(const ContactWork<T>& work, Stream to) {
 }
 
 template <class T>
-void run_contact(ContactTask task, const ContactWork<T>& work, int k, Stream to) {
+void run_contact(ContactTask task, const ContactWork<T>& work, int k, int trial, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
   switch (task) {
-    case ContactTask::start:
-      return launch_contact<ContactTask::start>(work, k, stream);
-    case ContactTask::go_first:
-      return launch_contact<ContactTask::go_first>(work, k, stream);
-    case ContactTask::iterate:
-      return launch_contact<ContactTask::iterate>(work, k, stream);
-    case ContactTask::go_last:
-      return launch_contact<ContactTask::go_last>(work, k, stream);
-    case ContactTask::finish:
-      return launch_contact<ContactTask::finish>(work, k, stream);
-    case ContactTask::write:
-      return launch_contact<ContactTask::write>(work, k, stream);
+#define X(name)           \
+  case ContactTask::name: \
+    return launch_contact<ContactTask::name>(work, k, trial, stream);
+    X(start)
+    X(go_first)
+    X(begin_correction)
+    X(correct)
+    X(iterate)
+    X(go_last)
+    X(finish)
+    X(write)
+#undef X
   }
 }
 

@@ -11,7 +11,7 @@
 
 namespace pd {
 
-enum class ContactTask { start, go_first, iterate, go_last, finish, write };
+enum class ContactTask { start, go_first, begin_correction, correct, iterate, go_last, finish, write };
 
 template <class T>
 struct ContactWork {
@@ -26,6 +26,7 @@ struct ContactWork {
   // of the runner
   T *x = nullptr, *u = nullptr, *before = nullptr, *target = nullptr, *planes = nullptr,
     *spheres = nullptr;
+  T* wall_forces = nullptr;  // [batch, planes and spheres, vertices, 4]: see cuda/rigid/contact_forces.h
   const double* sums = nullptr;  // [batch, sum_rows, sums_count]
   int sum_rows = 0;
   void* progress = nullptr;  // [batch]
@@ -40,9 +41,9 @@ std::int64_t contact_bytes(const ContactWork<T>& work);
 template <class T>
 void prepare_contact(const ContactWork<T>& work, Stream stream);
 
-// `k`: iteration
+// `k`: iteration; `trial`: of its coarse correction
 template <class T>
-void run_contact(ContactTask task, const ContactWork<T>& work, int k, Stream stream);
+void run_contact(ContactTask task, const ContactWork<T>& work, int k, int trial, Stream stream);
 
 // Keeps the displacements, before a coarse correction.
 template <class T>

@@ -1,16 +1,60 @@
 // The team of solver/contact on a GPU: some blocks, or one, that work on an environment.
 #pragma once
 #include "cuda/common/block_team.h"
+#include "solver/contact/environment.h"
 
 namespace pd::inline PD_TARGET {
 
 constexpr int contact_threads = 128;
 constexpr int contact_chunk = 1024;  // items of a sum that one block adds up
-constexpr int most_contact_sums = 12;
+constexpr int most_contact_sums = 36;
+
+// Lanes of solver/contact/clusters.h: those of a warp.
+struct WarpLanes {
+  PD_DEVICE int lane() const { return int(threadIdx.x) % warp_size; }
+  template <class Test>
+  PD_DEVICE unsigned which(const Test& test) const {
+    return __ballot_sync(full_warp, test(lane()));
+  }
+  template <class T, class BoxAt>
+  PD_DEVICE Box<T> unite(const BoxAt& box_at) const {
+    Box<T> whole = box_at(lane());
+#pragma unroll
+    for (int distance = warp_size / 2; distance > 0; distance /= 2) {
+      const auto other = [&](T number) { return __shfl_xor_sync(full_warp, number, distance); };
+      whole.add(Box<T>{{other(whole.low.x), other(whole.low.y), other(whole.low.z)},
+                       {other(whole.high.x), other(whole.high.y), other(whole.high.z)}});
+    }
+    return whole;
+  }
+  PD_DEVICE bool leads() const { return lane() == 0; }
+};
 
 // Sums do not depend on the number of blocks: every chunk is added up by one, and all add up the chunks alike.
+// A thread's item.
+template <class T>
+struct SingleLane {
+  using Number = T;
+  int item;
+
+  PD_DEVICE T load(const T* row) const { return row[item]; }
+  PD_DEVICE void store(T* row, T value) const { row[item] = value; }
+  template <class Get>
+  PD_DEVICE Vec3<T> vector(const Get& get) const {
+    const auto of = get(item);
+    return {of.x, of.y, of.z};
+  }
+  template <class Visit>
+  PD_DEVICE void each(const Visit& visit) const {
+    visit(item);
+  }
+  PD_DEVICE static bool all(bool holds) { return holds; }
+};
+
 class ContactTeam {
  public:
+  static constexpr bool in_order = false;
+
   // `partial`: [chunks, 2], `counts`: [chunks]
   PD_DEVICE ContactTeam(BlockTeam& team, double* partial, int* counts)
       : team_(team), partial_(partial), counts_(counts) {}
@@ -25,42 +69,60 @@ class ContactTeam {
     spread(count, item);
     barrier();
   }
-  // The lanes of a warp step through the tree together. What they find waits in a queue, until
-  // there is something to visit for every lane.
-  template <class Start, class Visit>
-  PD_DEVICE void walk(std::int64_t count, const Start& start, const Visit& visit) const {
-    const int lane = int(threadIdx.x) % warp_size;
-    int2* const queue = queue_of_warp();
-    std::int64_t base = team_.thread() - lane;
-    int queued = 0;
-    while (base < count || queued > 0) {
-      auto walk = start(int(min(base + lane, count - 1)));
-      bool walks = base + lane < count && !walk.ended;
-      base += team_.threads();
-      const bool last = base >= count;
+  template <class Visit>
+  PD_DEVICE void warps(int count, const Visit& visit) const {
 #pragma unroll 1
-      while (true) {
-        const int other = walks ? walk.step() : -1;
-        walks = walks && !walk.ended;
-        const unsigned found = __ballot_sync(full_warp, other >= 0);
-        if (other >= 0)
-          queue[queued + __popc(found & ((1u << lane) - 1))] = make_int2(walk.owner, other);
-        queued += __popc(found);
-        const bool active = __any_sync(full_warp, walks);
-        if (queued >= warp_size || (last && !active && queued > 0)) {
-          __syncwarp();
-          const int now = min(queued, warp_size);
-          if (lane < now) visit(queue[lane].x, queue[lane].y);
-          queued -= now;
-          __syncwarp();
-          if (lane < queued) queue[lane] = queue[warp_size + lane];
-          __syncwarp();
+    for (int n = team_.warp(); n < count; n += team_.warps()) visit(n, WarpLanes());
+  }
+  template <class T, class Visit>
+  PD_DEVICE void blocks(int count, const Visit& visit) const {
+    each(count, [&](int n) { visit(SingleLane<T>{n}); });
+  }
+  template <class T, class PairAt, class Visit>
+  PD_DEVICE void each_closest(int count, const PairAt& pair_at, const Vec3<T>* places,
+                              const Visit& visit) const {
+    each(count, [&](int n) { visit(n, closest_of(pair_at(n), places)); });
+  }
+
+  // A warp takes a cluster and tests the boxes of another one, each lane its own box against all.
+  // What meets waits in a queue, until there is something to visit for every lane.
+  template <class T, class Sides, class Visit>
+  PD_DEVICE void walk(const ClusterBoxes<T>& boxes, const Sides& sides, const Visit& visit) const {
+    const WarpLanes lanes;
+    const int lane = lanes.lane();
+    Bench<T>& bench = bench_of_warp<T>();
+    ClusterPairs<T> pairs(team_.warp(), team_.warps());
+    int queued = 0, number = 0;
+    unsigned meets = 0;
+    bool more = true;
+    while (true) {
+      while (queued < warp_size && more) {
+        if (__any_sync(full_warp, meets != 0)) {
+          const bool found = meets != 0;
+          const unsigned all = __ballot_sync(full_warp, found);
+          if (found)
+            bench.queue[queued + __popc(all & ((1u << lane) - 1))] =
+                sides(pairs.own, number, bench.number[take_lowest(meets)]);
+          queued += __popc(all);
+          continue;
         }
-        if (!active && (queued == 0 || !last)) break;
+        more = pairs.next(lanes, boxes);
+        if (!more) break;
+        number = boxes.leaf(pairs.own)[lane];
+        meets = meeting(lanes, boxes, pairs, bench);
       }
+      if (queued == 0) break;
+      __syncwarp();
+      const int now = min(queued, warp_size);
+      if (lane < now) visit(Found{bench.queue[lane]});
+      queued -= now;
+      __syncwarp();
+      if (lane < queued) bench.queue[lane] = bench.queue[warp_size + lane];
+      __syncwarp();
     }
     barrier();
   }
+
   template <class Task>
   PD_DEVICE void once(const Task& task) const {
     if (team_.thread() == 0) task();
@@ -148,13 +210,92 @@ class ContactTeam {
     for (int i = begin + int(threadIdx.x); i < end; i += contact_threads) take(i, least);
     block_reduce(least, Min{});
   }
+  template <class Is>
+  PD_DEVICE void select(int count, const Is& is, int* out) const {
+    int before = 0;
+#pragma unroll 1
+    for (int begin = 0; begin < count; begin += contact_threads) {
+      const int i = begin + int(threadIdx.x);
+      const bool own = i < count && is(i);
+      int total;
+      const int at = before + block_scan(own, total);
+      if (own) out[at] = i;
+      before += total;
+    }
+    __syncthreads();
+  }
   PD_DEVICE bool leads() const { return threadIdx.x == 0; }
 
  private:
+  // What a lane found.
+  struct Found {
+    SidePair side;
+
+    template <class Visit>
+    PD_DEVICE void each(const Visit& visit) const {
+      visit(side.owner, side.other);
+    }
+    template <class T, class SidesOf, class Visit>
+    PD_DEVICE void each_closest(const SidesOf& sides_of, const Vec3<T>* places,
+                                const Visit& visit) const {
+      visit(side.owner, side.other, closest_of(sides_of(side.owner, side.other), places));
+    }
+  };
+  template <class Pair, class T>
+  PD_DEVICE static Closest<T> closest_of(const Pair& pair, const Vec3<T>* places) {
+    Vec3<T> corner[4];
+    pair.corners(places, corner);
+    return closest_points(pair.edges, corner);
+  }
+
+  // What a warp keeps in shared memory: sides of a cluster that meet the hull of another one.
+  template <class T>
+  struct Bench {
+    Four<T> low[warp_size], high[warp_size];
+    int corner[3][warp_size], number[warp_size];
+    SidePair queue[2 * warp_size];
+  };
   // One for all walks of a kernel.
-  PD_DEVICE static int2* queue_of_warp() {
-    __shared__ int2 queues[contact_threads / warp_size][2 * warp_size];
-    return queues[threadIdx.x / warp_size];
+  template <class T>
+  PD_DEVICE static Bench<T>& bench_of_warp() {
+    __shared__ Bench<T> benches[contact_threads / warp_size];
+    return benches[threadIdx.x / warp_size];
+  }
+
+  // Bits of the sides on the bench whose boxes meet that of the lane, and that share no vertex.
+  template <class T>
+  PD_DEVICE static unsigned meeting(const WarpLanes& lanes, const ClusterBoxes<T>& boxes,
+                                    const ClusterPairs<T>& pairs, Bench<T>& bench) {
+    const int lane = lanes.lane();
+    const int *own_leaf = boxes.leaf(pairs.own), *leaf = boxes.leaf(pairs.other);
+    const Box<T> box = boxes.box[pairs.other].box(lane), own = boxes.box[pairs.own].box(lane);
+    const bool touches = box.meets(pairs.hull);
+    const unsigned all = __ballot_sync(full_warp, touches);
+    const int count = __popc(all);
+    __syncwarp();
+    if (touches) {
+      const int at = __popc(all & ((1u << lane) - 1));
+      bench.low[at] = {box.low.x, box.low.y, box.low.z, T(0)};
+      bench.high[at] = {box.high.x, box.high.y, box.high.z, T(0)};
+      for (int c = 0; c < 3; ++c) bench.corner[c][at] = leaf[warp_size * (c + 1) + lane];
+      bench.number[at] = leaf[lane];
+    }
+    __syncwarp();
+    const bool point = boxes.has_points(pairs.own);
+    unsigned meets = 0;
+#pragma unroll 2
+    for (int n = 0; n < count; ++n) {
+      const Four<T> low = bench.low[n], high = bench.high[n];
+      const bool is = own.meets({{low.x, low.y, low.z}, {high.x, high.y, high.z}}) &
+                      boxes.share_none(point, own_leaf, lane, &bench.corner[0][0] - warp_size, n);
+      meets |= unsigned(is) << n;
+    }
+    // of a cluster with itself each two once
+    if (pairs.own == pairs.other) {
+      const int before = __popc(all & ((2u << lane) - 1));  // no later than the lane's own
+      meets = before < warp_size ? meets & (~0u << before) : 0;
+    }
+    return meets;
   }
 
   template <int Count>

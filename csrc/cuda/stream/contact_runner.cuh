@@ -3,6 +3,7 @@
 #pragma once
 #include "cuda/contact/launch.h"
 #include "cuda/stream/runner.cuh"
+#include "solver/contact/schedule.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -34,6 +35,7 @@ ContactWork<T> contact_work(const StreamCall<T>& call, const ContactCall<T>& con
   work.target = numbers(m.target);
   work.planes = numbers(m.planes);
   work.spheres = numbers(m.spheres);
+  work.wall_forces = numbers(m.forces.force);
   work.sums = m.sums;
   work.sum_rows = call.sum_rows();
   work.progress = m.progress;
@@ -81,16 +83,18 @@ class ContactRunner : public StreamRunner<T, HasContacts> {
     if (work_.pieces > 0) keep_displacements(work_, stream_);
     Base::align();
     run(begun_ ? ContactTask::go_last : ContactTask::go_first);
+    correct(begun_ ? this->set_.iterations : 0);
     begun_ = true;
   }
 
   void iterate(int k) {
+    if (has_correction(k, this->set_.iterations)) correct(k);
     if (k % guard_period == 0 && this->set_.schedule == ScheduleKind::guarded) {
       this->template pass<Visit::update_guarded, false>(k);
     } else {
       this->template pass<Visit::update, false>(k);
     }
-    run_contact(ContactTask::iterate, work_, k, stream_);
+    run(ContactTask::iterate, k);
   }
 
   void finish() {
@@ -99,7 +103,19 @@ class ContactRunner : public StreamRunner<T, HasContacts> {
   }
 
  private:
-  void run(ContactTask task) { run_contact(task, work_, 0, stream_); }
+  void run(ContactTask task, int k = 0, int trial = 0) {
+    run_contact(task, work_, k, trial, stream_);
+  }
+
+  // The coarse correction of bodies in contact. Environments that do not ask for a trial return at once.
+  void correct(int k) {
+    if (work_.pieces == 0) return;
+    for (int trial = 0; trial < (HasContacts ? coarse_trials : 1); ++trial) {
+      run(ContactTask::begin_correction, k, trial);
+      if (HasContacts) this->template pass<Visit::keep_forces>(int(Iterate::last));
+      run(ContactTask::correct, k, trial);
+    }
+  }
 
   ContactWork<T> work_;
   cudaStream_t stream_;

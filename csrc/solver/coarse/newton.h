@@ -40,6 +40,11 @@ PD_HD Mat3<double> small_turn(const Vec3<double>& v) {
   return turn;
 }
 
+// w of the turn of a motion by 2 atan(|w| / 2): Cayley's formula backward.
+PD_HD Vec3<double> turn_vector(const RigidMotion<double>& motion) {
+  return (2.0 / (4.0 + trace(motion.turn))) * axis_of(motion.turn);
+}
+
 PD_HD bool is_positive(const Mat3<double>& a) {
   return a.row[0].x > 0 &&
          difference_of_products(a.row[0].x, a.row[1].y, a.row[0].y, a.row[1].x) > 0 &&
@@ -61,6 +66,7 @@ class CoarseBody {
   PD_HD bool moves() const { return body_.weight > 0 && body_.hold != Hold::all; }
   PD_HD bool is_done() const { return done_; }
   PD_HD const RigidMotion<double>& motion() const { return accepted_; }
+  PD_HD const RigidMotion<double>& next_motion() const { return trial_; }
   // Phi before the last step, the quadratics relative to no motion
   PD_HD double reached() const { return reached_; }
 
@@ -220,6 +226,18 @@ class CoarseBody {
           term = r == 6 ? force * axis[c - 3] : r == c ? along : 0.0;
         }
       }
+    }
+  }
+
+  // Derivatives by a twist become those by a twist in lengths that pins leave.
+  PD_HD void keep_twist(double (&line)[6]) const {
+    for (int i = 3; i < 6; ++i) line[i] *= length_;
+    if (body_.hold == Hold::none) return;
+    const double axis[3] = {body_.axis.x, body_.axis.y, body_.axis.z};
+    const double along = line[3] * axis[0] + line[4] * axis[1] + line[5] * axis[2];
+    for (int i = 0; i < 3; ++i) {
+      line[i] = 0;
+      if (body_.hold == Hold::line) line[3 + i] = along * axis[i];
     }
   }
 

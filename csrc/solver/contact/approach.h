@@ -74,28 +74,24 @@ class ContactApproach {
     return {double(a.x), double(a.y), double(a.z)};
   }
   PD_HD static Vec3<T> narrow(const Vec3<double>& a) { return {T(a.x), T(a.y), T(a.z)}; }
+  PD_HD static int min_of(int a, int b) { return a < b ? a : b; }
   PD_HD static void add_to(double* sum, const Vec3<double>& a) {
     sum[0] = a.x, sum[1] = a.y, sum[2] = a.z;
   }
 
   template <class Team>
   PD_HD void find_rigid_ways(const Team& team) const {
-    team.each(plan_.bodies, [&](int b) {
-      a_.body_begin[b] = plan_.vertices, a_.body_end[b] = 0;
-      a_.pinned[b] = 0;
-    });
+    team.each(plan_.bodies, [&](int b) { a_.pinned[b] = 0; });
     team.each(plan_.body_vertices, [&](int v) {
-      lower(a_.body_begin + plan_.body[v], v);
-      raise(a_.body_end + plan_.body[v], v + 1);
       if (env_.held(v)) a_.pinned[plan_.body[v]] = 1;
     });
     team.groups(plan_.bodies, [&](int b, const auto& group) {
-      const int begin = a_.body_begin[b], end = a_.body_end[b];
+      const int begin = plan_.body_start[b],
+                end = min_of(plan_.body_start[b + 1], plan_.body_vertices);
       double sums[7] = {};
       group.sum_range(
           begin, end,
           [&](int v, double (&sum)[7]) {
-            if (plan_.body[v] != b) return;
             const double m = double(env_.body.mass[v]);
             const Vec3<double> way = wide(a_.target[v]) - wide(a_.place[v]);
             sum[0] += m;
@@ -113,7 +109,6 @@ class ContactApproach {
       group.sum_range(
           begin, end,
           [&](int v, double (&sum)[12]) {
-            if (plan_.body[v] != b) return;
             const Vec3<double> way = wide(a_.target[v]) - wide(a_.place[v]);
             Mat3<double> moment = {
                 {{sum[0], sum[1], sum[2]}, {sum[3], sum[4], sum[5]}, {sum[6], sum[7], sum[8]}}};
@@ -146,20 +141,43 @@ class ContactApproach {
                     rest = a_.target[v] - place - narrow(a_.rigid[plan_.body[v]].at(wide(place)));
       a_.weight[v] = square_root(dot(rest, rest));
     });
-    const auto box_of = [&](int v) { return Box<T>{a_.place[v], a_.place[v]}; };
-    const auto reach = [&](int v) { return a_.weight[v] + T(0.5) * plan_.thickness; };
-    search_.refit(team, box_of, reach);
-    search_.each_boxed(
-        team, box_of, reach, [](int) { return true; },
-        [&](int, int, ContactPair<T>& pair) {
-          const int b = plan_.body[pair.vertex[0]];
-          if (b != plan_.body[pair.vertex[3]] || !a_.own[b]) return;
-          Vec3<T> start[4], end[4];
-          pair.corners(a_.place, start);
-          pair.corners(a_.target, end);
-          const auto own_reach = [&](int v) { return a_.weight[v]; };
-          if (!stays_apart(pair, start, end, own_reach, plan_.thickness)) a_.own[b] = 0;
-        });
+    team.groups(plan_.bodies, [&](int b, const auto& group) {
+      bool asked = a_.own[b] && plan_.touches_itself[b];
+      if (asked && plan_.rest_apart[b] > T(0)) {
+        double most[1] = {0};
+        group.least_range(
+            plan_.surface_start[b], plan_.surface_start[b + 1],
+            [&](int n, double (&low)[1]) {
+              const double own = -double(a_.weight[plan_.point[n]]);
+              low[0] = own < low[0] ? own : low[0];
+            },
+            most);
+        const T room = search_.shapes().apart(group, b, a_.place) -
+                       T(1.0 + slack_share) * plan_.thickness;
+        asked = !(T(-2) * T(most[0]) <= room);
+      }
+      if (group.leads()) a_.itself[b] = asked;
+    });
+    const bool asks = search_.fit(
+        team, [&](int v) { return Box<T>{a_.place[v], a_.place[v]}; },
+        [&](int v) { return a_.weight[v] + T(0.5) * plan_.thickness; }, false);
+    if (asks)
+      search_.each_boxed(team, [&](const auto& found) {
+        found.each([&](int owner, int other) { unfold(owner, other); });
+      });
+    // between bodies alone from now on
+    team.each(plan_.bodies, [&](int b) { a_.itself[b] = 0; });
+  }
+
+  PD_CALLED void unfold(int owner, int other) const {
+    ContactPair<T> pair;
+    const int b = plan_.body[search_.sides_of(owner, other).vertex[0]];
+    if (!a_.own[b] || !search_.find_pair(owner, other, pair)) return;
+    Vec3<T> start[4], end[4];
+    pair.corners(a_.place, start);
+    pair.corners(a_.target, end);
+    const auto own_reach = [&](int v) { return a_.weight[v]; };
+    if (!stays_apart(pair, start, end, own_reach, plan_.thickness)) a_.own[b] = 0;
   }
 
   // of vertices of bodies, from `shift`, where the step began; checks come later
@@ -185,49 +203,37 @@ class ContactApproach {
     return side + T(0.5) * plan_.thickness;
   }
 
-  // Calls visit(pair, last) for pairs of different bodies that may meet on the way from the places
-  // to the ends, round after round, while it lowers shares. Bodies of a group have one share,
+  // Calls visit(owner, other, last) for pairs of different bodies that may meet on the way from the
+  // places to the ends, round after round, while it lowers shares. Bodies of a group have one share,
   // `limit` at the start of a round.
   template <class Team, class Visit>
   PD_HD void each_between(const Team& team, T* shares, const Visit& visit) const {
     ContactNumbers& numbers = env_.numbers();
-    const auto box_of = [&](int v) { return swept(v); };
-    const auto reach = [&](int v) { return bow(v); };
-    team.groups(plan_.bodies, [&](int b, const auto& group) {
-      const double far = HUGE_VAL;
-      double least[6] = {far, far, far, far, far, far};
-      group.least_range(
-          0, plan_.points,
-          [&](int n, double (&low)[6]) {
-            const int v = plan_.point[n];
-            if (plan_.body[v] != b) return;
-            const Box<T> box = swept(v).widened(bow(v));
-            const double sides[6] = {double(box.low.x),   double(box.low.y),   double(box.low.z),
-                                     -double(box.high.x), -double(box.high.y), -double(box.high.z)};
-            for (int s = 0; s < 6; ++s) low[s] = sides[s] < low[s] ? sides[s] : low[s];
-          },
-          least);
-      if (group.leads())
-        a_.body_box[b] = {{T(least[0]), T(least[1]), T(least[2])},
-                          {T(-least[3]), T(-least[4]), T(-least[5])}};
-    });
-    team.each(plan_.bodies, [&](int one) {
-      for (int other = one + 1; other < plan_.bodies; ++other)
-        if (a_.body_box[one].meets(a_.body_box[other])) numbers.meets = 1;
-    });
-    const bool meets = numbers.meets != 0;
-    if (meets) search_.refit(team, box_of, reach);
-    for (int round = 0; meets && round < share_rounds; ++round) {
-      set_limits(team, shares);
-      search_.each_boxed(
-          team, box_of, reach, [](int) { return true; },
-          [&](int, int, ContactPair<T>& pair) {
-            if (plan_.body[pair.vertex[0]] != plan_.body[pair.vertex[3]])
-              visit(pair, round + 1 == share_rounds);
+    const bool meets = search_.fit(
+        team, [&](int v) { return swept(v); }, [&](int v) { return bow(v); }, true);
+    if (meets) {
+      team.once([&] { numbers.listed = 0; });
+      search_.each_boxed(team, [&](const auto& found) {
+        found.each([&](int owner, int other) { search_.list(owner, other, T(0)); });
+      });
+      const bool whole = search_.is_whole();
+      const int listed = numbers.listed;
+      for (int round = 0; round < share_rounds; ++round) {
+        const bool last = round + 1 == share_rounds;
+        set_limits(team, shares);
+        if (whole) {
+          team.each(listed, [&](int n) {
+            visit(a_.near_side[n].owner, a_.near_side[n].other, last);
           });
-      const bool changed = numbers.changed != 0;
-      team.barrier();
-      if (!changed) break;
+        } else {
+          search_.each_boxed(team, [&](const auto& found) {
+            found.each([&](int owner, int other) { visit(owner, other, last); });
+          });
+        }
+        const bool changed = numbers.changed != 0;
+        team.barrier();
+        if (!changed) break;
+      }
     }
     set_limits(team, shares);
     team.each(plan_.bodies, [&](int b) { shares[b] = a_.limit[b]; });
@@ -237,8 +243,8 @@ class ContactApproach {
   PD_HD void set_limits(const Team& team, const T* shares) const {
     team.spread(1, [&](int) { env_.numbers().changed = 0; });
     team.each(plan_.bodies, [&](int b) { a_.joint[b] = T(1); });
-    team.each(plan_.bodies, [&](int b) { lower(a_.joint + root_of(a_.group, b), shares[b]); });
-    team.each(plan_.bodies, [&](int b) { a_.limit[b] = a_.joint[root_of(a_.group, b)]; });
+    team.each(plan_.bodies, [&](int b) { lower(a_.joint + root_of(a_.joined, b), shares[b]); });
+    team.each(plan_.bodies, [&](int b) { a_.limit[b] = a_.joint[root_of(a_.joined, b)]; });
   }
 
   // Lowers the share of a body; in the `last` round to 0.
@@ -270,10 +276,8 @@ class ContactApproach {
 
   template <class Team>
   PD_HD void go_together(const Team& team) const {
-    ContactNumbers& numbers = env_.numbers();
-    team.spread(1, [&](int) { numbers.meets = 0; });
     team.each(plan_.bodies, [&](int b) {
-      a_.moves[b] = 0, a_.group[b] = b;
+      a_.moves[b] = 0, a_.joined[b] = b;
       a_.together[b] = a_.alone[b] = T(1);
     });
     team.each(plan_.vertices, [&](int v) {
@@ -283,59 +287,81 @@ class ContactApproach {
     lower_by_walls(
         team, a_.together, [&](int b) { return a_.moves[b] != 0; },
         [&](int v, T s) { return at(v, s); });
-    each_between(team, a_.together, [&](const ContactPair<T>& pair, bool last) {
-      const int bodies[2] = {plan_.body[pair.vertex[0]], plan_.body[pair.vertex[3]]};
-      const bool moves[2] = {a_.moves[bodies[0]] != 0, a_.moves[bodies[1]] != 0};
-      if (!moves[0] && !moves[1]) return;
-      if (moves[0] && moves[1]) join(a_.group, bodies[0], bodies[1]);
-      Vec3<T> start[4], end[4];
-      pair.corners(a_.place, start);
-      pair.corners(a_.end, end);
-      const Kept<T> kept = direction_of(pair, start, end);
-      T limit(1);
-      for (int side = 0; side < 2; ++side)
-        limit = moves[side] ? lesser(limit, a_.limit[bodies[side]]) : limit;
-      const T share = share_below(limit, [&](T s) {
-        Vec3<T> corner[4];
-        for (int c = 0; c < 4; ++c) {
-          const int v = pair.vertex[c];
-          corner[c] = a_.moves[plan_.body[v]] ? at(v, s) : a_.shift[v];
-        }
-        return kept.allows(pair.edges, corner);
-      });
-      for (int side = 0; side < 2; ++side)
-        if (moves[side]) take(a_.together, bodies[side], limit, share, last);
+    each_between(team, a_.together,
+                 [&](int owner, int other, bool last) { lower_together(owner, other, last); });
+  }
+
+  // Lowers the common shares of the bodies of a pair to what it allows.
+  PD_CALLED void lower_together(int owner, int other, bool last) const {
+    ContactPair<T> pair;
+    if (!search_.find_pair(owner, other, pair)) return;
+    const int bodies[2] = {plan_.body[pair.vertex[0]], plan_.body[pair.vertex[3]]};
+    const bool moves[2] = {a_.moves[bodies[0]] != 0, a_.moves[bodies[1]] != 0};
+    if (!moves[0] && !moves[1]) return;
+    if (moves[0] && moves[1]) join(a_.joined, bodies[0], bodies[1]);
+    Vec3<T> start[4], end[4];
+    pair.corners(a_.place, start);
+    pair.corners(a_.end, end);
+    const Kept<T> kept = direction_of(pair, start, end);
+    T limit(1);
+    for (int side = 0; side < 2; ++side)
+      limit = moves[side] ? lesser(limit, a_.limit[bodies[side]]) : limit;
+    const T share = share_below(limit, [&](T s) {
+      Vec3<T> corner[4];
+      for (int c = 0; c < 4; ++c) {
+        const int v = pair.vertex[c];
+        corner[c] = a_.moves[plan_.body[v]] ? at(v, s) : a_.shift[v];
+      }
+      return kept.allows(pair.edges, corner);
     });
+    for (int side = 0; side < 2; ++side)
+      if (moves[side]) take(a_.together, bodies[side], limit, share, last);
   }
 
   template <class Team>
   PD_HD void go_alone(const Team& team) const {
-    team.spread(1, [&](int) { env_.numbers().meets = 0; });
-    team.each(plan_.bodies, [&](int b) { a_.group[b] = b; });
-    const Ball<T> anywhere{{T(0), T(0), T(0)}, T(HUGE_VAL)};
-    const auto after = [&](int v, T s) {
-      const T done = a_.together[plan_.body[v]];
-      return at(v, done + s * (T(1) - done));
-    };
-    const auto has_rest = [&](int b) { return T(1) - a_.together[b] > T(0); };
-    lower_by_walls(team, a_.alone, has_rest, after);
-    each_between(team, a_.alone, [&](ContactPair<T>& pair, bool last) {
-      if (!has_rest(plan_.body[pair.vertex[0]]) && !has_rest(plan_.body[pair.vertex[3]])) return;
-      Vec3<T> corner[4];
-      pair.corners(a_.place, corner);
-      make_plane(pair, a_.place, a_.end, closest_points(pair.edges, corner), Vec3<T>{});
-      for (int c = 0; c < 4; ++c) {
-        const int v = pair.vertex[c], b = plan_.body[v];
-        if (!has_rest(b)) continue;
-        const T limit = a_.limit[b];
-        const T share = pair.plane.frozen ? T(0) : share_below(limit, [&](T s) {
-          return is_allowed(after(v, s), anywhere, [&](const auto& visit) {
-            visit_space(pair.plane, pair.on_a(c), visit);
-          });
-        });
-        take(a_.alone, b, limit, share, last);
-      }
+    ContactNumbers& numbers = env_.numbers();
+    team.once([&] { numbers.changed = 0; });
+    team.each(plan_.bodies, [&](int b) {
+      a_.joined[b] = b;
+      if (has_rest(b)) numbers.changed = 1;
     });
+    const bool rests = numbers.changed != 0;
+    team.barrier();
+    if (!rests) return;
+    lower_by_walls(team, a_.alone, [&](int b) { return has_rest(b); },
+                   [&](int v, T s) { return after(v, s); });
+    each_between(team, a_.alone,
+                 [&](int owner, int other, bool last) { lower_alone(owner, other, last); });
+  }
+
+  PD_HD bool has_rest(int b) const { return T(1) - a_.together[b] > T(0); }
+  // The place after a share of the rest of the way.
+  PD_HD Vec3<T> after(int v, T s) const {
+    const T done = a_.together[plan_.body[v]];
+    return at(v, done + s * (T(1) - done));
+  }
+
+  // Lowers the shares of the bodies of a pair to what its plane allows.
+  PD_CALLED void lower_alone(int owner, int other, bool last) const {
+    ContactPair<T> pair = search_.sides_of(owner, other);
+    if (!has_rest(plan_.body[pair.vertex[0]]) && !has_rest(plan_.body[pair.vertex[3]])) return;
+    if (!search_.find_pair(owner, other, pair)) return;
+    const Ball<T> anywhere{{T(0), T(0), T(0)}, T(HUGE_VAL)};
+    Vec3<T> corner[4];
+    pair.corners(a_.place, corner);
+    make_plane(pair, a_.place, a_.end, closest_points(pair.edges, corner), Vec3<T>{});
+    for (int c = 0; c < 4; ++c) {
+      const int v = pair.vertex[c], b = plan_.body[v];
+      if (!has_rest(b)) continue;
+      const T limit = a_.limit[b];
+      const T share = pair.plane.frozen ? T(0) : share_below(limit, [&](T s) {
+        return is_allowed(after(v, s), anywhere, [&](const auto& visit) {
+          visit_space(pair.plane, pair.on_a(c), visit);
+        });
+      });
+      take(a_.alone, b, limit, share, last);
+    }
   }
 
   const Env& env_;

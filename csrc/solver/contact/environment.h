@@ -3,20 +3,29 @@
 // A phase calls a function for every item: vertex, pair, part of a surface, body. Items of a phase
 // do not depend on each other, so any number of threads has the same bits. A team offers
 //
+//   in_order               whether one thread takes all items in their order
 //   spread(count, item)    a phase; each(count, item): and a barrier, after which all see what it wrote
 //   once(task)             one thread, and a barrier
 //   sum(count, add, sums)  sums of doubles in a fixed order, the same in all threads; scan(numbers, count): prefix sums
-//   walk(count, start, visit)  walks start(item) through a tree, and visit(owner, other) for what they find
-//   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own
+//   walk(boxes, sides, visit)  pairs of sides whose boxes meet; see solver/contact/search.h
+//   warps(count, visit)    visit(n, lanes) for every n by 32 lanes of solver/contact/clusters.h
+//   each_closest(count, pair_at, places, visit)  visit(n, closest points) of pairs, and a barrier
+//   blocks<T>(count, visit)  visit(lanes) for blocks of items in vector instructions, and a barrier
+//   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own, and
+//                          select: items in their order
 //
 // All threads of a team take the same branches: what they decide by is not written in the phase that follows.
 #pragma once
-#include "contact/box.h"
 #include "contact/pairs/shares.h"
 #include "solver/chebyshev.h"
+#include "solver/coarse/island.h"
+#include "solver/contact/clusters.h"
 #include "solver/contact/shared_numbers.h"
 #include "solver/step.h"
 #include "solver/vertex.h"
+#if !defined(__CUDACC__)
+#include "math/pack.h"
+#endif
 
 #include <cstddef>
 #include <cstdint>
@@ -30,8 +39,10 @@ struct ContactNumbers {
   int searched_at;
   int waits, checked;
   // of an iteration
-  int active, outside, loaded, cut, stopped, meets, changed, near;
-  int stuck;  // whether a pair of the list may be frozen
+  int active, outside, loaded, cut, stopped, meets, changed;
+  int listed;  // near pairs that were found, listed or not
+  int corrects, searching, leaves, cuts, pushes;  // of a coarse correction
+  int moved, changes[contact_sweeps];  // vertices of active pairs; whether sweeps change a force
 };
 
 // Four numbers, for loads of 16 bytes.
@@ -40,12 +51,56 @@ struct alignas(4 * sizeof(T) > 16 ? 16 : 4 * sizeof(T)) Four {
   T x, y, z, w;
 };
 
-// What a pair keeps over the sweeps of an iteration.
-template <class T>
-struct PairSweep {
-  T beta;
-  Vec3<T> before;  // sum w x_t
+// Two sides: a row of `point` or, above these, an edge; and a triangle, or a later edge.
+struct SidePair {
+  int owner, other;
 };
+
+#if defined(__CUDACC__)
+template <class T>
+PD_HD Four<T> multiply_add(T s, const Four<T>& a, const Four<T>& b) {
+  return {multiply_add(s, a.x, b.x), multiply_add(s, a.y, b.y), multiply_add(s, a.z, b.z), T(0)};
+}
+#else
+template <class T>
+PD_HD Four<T> multiply_add(T s, const Four<T>& a, const Four<T>& b) {
+  using P = Pack<T, 4>;
+  Four<T> sum;
+  multiply_add(P(s), P::load(&a.x), P::load(&b.x)).store(&sum.x);
+  return sum;
+}
+#endif
+
+// What active pairs keep over the sweeps of an iteration, row by row.
+template <class T>
+struct ActiveRows {
+  static constexpr int weight = 0, moves = 4,  // of the corners; theta omega w / D
+      between = 8, before = 11, normal = 14,   // sums w x of targets, and at the step's start
+      tangential = 17, normal_force = 20, force = 21, beta = 24, thickness = 25, friction = 26,
+                       count = 27;
+  static constexpr int padding = 16;  // lanes past the last pair
+
+  T* numbers;     // [count, stride]
+  int* integers;  // [5, stride]: pair, vertices
+  std::int64_t stride;
+
+  PD_HD ActiveRows(T* memory, int capacity)
+      : numbers(memory),
+        integers(reinterpret_cast<int*>(memory + count * (std::int64_t(capacity) + padding))),
+        stride(std::int64_t(capacity) + padding) {}
+
+  PD_HD static std::int64_t size(int capacity) {
+    return (count + 5) * (std::int64_t(capacity) + padding);
+  }
+  PD_HD T* row(int n) const { return numbers + n * stride; }
+  PD_HD T& at(int n, int q) const { return row(n)[q]; }
+  PD_HD int& pair(int q) const { return integers[q]; }
+  PD_HD int& vertex(int corner, int q) const { return integers[(1 + corner) * stride + q]; }
+};
+
+// Whether planes that are new since the last move may cut the way of a vertex, or whether it must stay: targets have been
+// compared with all others.
+enum Limits : int { limits_none, limits_planes, limits_stuck };
 
 // Arrays of an environment. Vertices have the user's numbers, those of colliders last.
 template <class T>
@@ -53,14 +108,16 @@ struct ContactArrays {
   Vec3<T>*begin, *place, *target, *goal, *shift, *checked, *end;  // [vertices] m
   Ball<T>* ball;                                                  // [vertices]
   T *inverse, *weight, *room;                                     // [vertices]
-  unsigned char *held, *cut, *surface, *touched;                  // [vertices]
+  unsigned char *held, *cut, *surface;                            // [vertices]
+  int *limits, *touched, *moved;  // [vertices] Limits; of an active pair; those in any order
+  Four<T>* moved_by;              // [vertices] by active pairs, m
   // Entries of vertices: corners of their pairs, in the order of the pairs.
   int *start, *cursor;  // [vertices + 1] first entry of each; counts
   int *entry, *slot;    // [4 capacity] pair * 4 + corner in any order; the entry of each corner
   Four<T>*push,
       *space;  // [4 capacity] by entry: force of the pair and weight; normal and bound of a half-space
-  T* margin;                            // [4 capacity] of the half-space, or -1: its pair is frozen
-  PairSweep<T>* sweep;                  // [capacity]
+  T* margin;                            // [4 capacity] of the half-space
+  T* rows;                              // ActiveRows
   ContactPair<T>* pair;                 // [capacity] in the order of their keys
   unsigned char* active;                // [capacity]
   std::int64_t* known_key;              // [capacity] of the list before
@@ -68,31 +125,49 @@ struct ContactArrays {
   int *owner, *partner;                 // [capacity] parts of a pair
   int* owner_start;                     // [owners + 1] pairs of each vertex, then of each edge
   int* owner_near;                      // [owners]
-  Box<T>*triangle_box, *edge_box;       // of trees, all levels
   RigidWay* rigid;                      // [bodies]
   Box<T>* body_box;                     // [bodies]
   T *together, *alone, *joint, *limit;  // [bodies] shares of ways
-  int *body_begin, *body_end;           // [bodies] vertices
-  int* group;                           // [bodies]
+  int* joined;                          // [bodies] links to lesser bodies of a group
   unsigned char *own, *pinned, *moves;  // [bodies]
   Hand<T>* hand;                        // [colliders]
   Screw<T>* screw;                      // [colliders]
   T *share, *least, *bound;             // [colliders]
   int* barred;                          // [colliders]
-  unsigned char* touches;               // [components]
+  // of the coarse correction
+  int *inside, *component;  // [vertices] of bodies: internal number; component that moves rigidly, or -1
+  CoarseBody* coarse_body;                              // [components]
+  CoarseIsland* island;                                 // [components] by its least member
+  RigidMotion<double>* motion;                          // [components]
+  double *coarse_sum, *newton, *matrix;                 // [components, 31], [components, 18], [components^2, 36]
+  double *coarse_share, *coarse_joint, *coarse_limit;   // [components]
+  int *root, *size, *first, *local, *member;            // [components] of islands
+  int *component_begin, *component_end, *coarse_group;  // [components]
+  int *side_start, *side_pair;  // [components + 1], [2 capacity] pairs of each component
+  unsigned char *valid, *touches, *couple, *joins;  // [components], [components^2], [capacity]
+  PairTerms* terms;                                 // [capacity]
+  double* radius;                                   // [capacity] of friction; of a check, psi
   T* most;                              // [colliders + 2]: held back, pins held back, least d / r
+  // of the search
+  Cluster<T>*cluster, *group;  // [clusters] boxes of sides; [groups] of trees over clusters
+  SidePair* near_side;         // [near pairs] in any order
+  T* near_value;               // [near pairs]
+  T* ball_most;                // [bodies] largest radius of balls
+  // [bodies] asked: with itself, with any; moves by hand
+  unsigned char *itself, *wanted, *by_hand;
   ContactNumbers* numbers;
 };
 
-// Numbers of nodes of a tree over `count` leaves with 32 children a node.
-constexpr int tree_fan = 32;
-PD_HD std::int64_t count_nodes(int count) {
-  std::int64_t all = count;
-  for (int n = count; n > 1;) {
-    n = (n + tree_fan - 1) / tree_fan;
-    all += n;
-  }
-  return all;
+template <class T>
+PD_HD int count_all_groups(const ContactPlan<T>& plan) {
+  return count_groups(plan.point_clusters) + count_groups(plan.edge_clusters) +
+         count_groups(plan.clusters - plan.point_clusters - plan.edge_clusters);
+}
+
+// Room of the list of near pairs: balls reach a part of them.
+template <class T>
+PD_HD int count_near(const ContactPlan<T>& plan) {
+  return 2 * plan.capacity;
 }
 
 // `arena`: place(array, count)
@@ -104,13 +179,15 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
     arena.place(*array, v);
   arena.place(a.ball, v);
   for (T** array : {&a.inverse, &a.weight, &a.room}) arena.place(*array, v);
-  for (unsigned char** array : {&a.held, &a.cut, &a.surface, &a.touched}) arena.place(*array, v);
+  for (unsigned char** array : {&a.held, &a.cut, &a.surface}) arena.place(*array, v);
+  for (int** array : {&a.limits, &a.touched, &a.moved}) arena.place(*array, v);
+  arena.place(a.moved_by, v);
   for (int** array : {&a.start, &a.cursor}) arena.place(*array, v + 1);
   arena.place(a.entry, 4 * m + 1);
   arena.place(a.slot, 4 * m);
   for (Four<T>** array : {&a.push, &a.space}) arena.place(*array, 4 * m);
   arena.place(a.margin, 4 * m);
-  arena.place(a.sweep, m);
+  arena.place(a.rows, ActiveRows<T>::size(plan.capacity));
   arena.place(a.pair, m);
   arena.place(a.active, m);
   arena.place(a.known_key, m);
@@ -118,19 +195,42 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   for (int** array : {&a.owner, &a.partner}) arena.place(*array, m);
   arena.place(a.owner_start, owners + 1);
   arena.place(a.owner_near, owners);
-  arena.place(a.triangle_box, count_nodes(plan.triangles));
-  arena.place(a.edge_box, count_nodes(plan.edges));
   arena.place(a.rigid, b);
   arena.place(a.body_box, b);
   for (T** array : {&a.together, &a.alone, &a.joint, &a.limit}) arena.place(*array, b);
-  for (int** array : {&a.body_begin, &a.body_end, &a.group}) arena.place(*array, b);
+  arena.place(a.joined, b);
   for (unsigned char** array : {&a.own, &a.pinned, &a.moves}) arena.place(*array, b);
   arena.place(a.hand, c);
   arena.place(a.screw, c);
   for (T** array : {&a.share, &a.least, &a.bound}) arena.place(*array, c);
   arena.place(a.barred, c);
-  arena.place(a.touches, components);
+  const std::int64_t g = components;
+  for (int** array : {&a.inside, &a.component}) arena.place(*array, v);
+  arena.place(a.coarse_body, g);
+  arena.place(a.island, g);
+  arena.place(a.motion, g);
+  arena.place(a.coarse_sum, ContactSums::count * g);
+  arena.place(a.newton, 18 * g);
+  arena.place(a.matrix, 36 * g * g);
+  for (double** array : {&a.coarse_share, &a.coarse_joint, &a.coarse_limit})
+    arena.place(*array, g);
+  for (int** array : {&a.root, &a.size, &a.first, &a.local, &a.member, &a.component_begin,
+                      &a.component_end, &a.coarse_group})
+    arena.place(*array, g);
+  arena.place(a.side_start, g + 1);
+  arena.place(a.side_pair, g > 0 ? 2 * m : 0);
+  for (unsigned char** array : {&a.valid, &a.touches}) arena.place(*array, g);
+  arena.place(a.couple, g * g);
+  arena.place(a.joins, g > 0 ? m : 0);
+  arena.place(a.terms, g > 0 ? m : 0);
+  arena.place(a.radius, m);
   arena.place(a.most, c + 2);
+  arena.place(a.cluster, plan.clusters);
+  arena.place(a.group, count_all_groups(plan));
+  arena.place(a.near_side, count_near(plan));
+  arena.place(a.near_value, count_near(plan));
+  arena.place(a.ball_most, b);
+  for (unsigned char** array : {&a.itself, &a.wanted, &a.by_hand}) arena.place(*array, b);
   arena.place(a.numbers, 1);
 }
 
@@ -142,7 +242,7 @@ struct BodyState {
   const int *order, *component;    // user's number; component that moves rigidly, or -1
   const T* x;                      // at the start of the step
   T *u, *before;                   // displacement of the iterate, and of the one before
-  const T *free, *target, *saved;  // of the free iterate; s; before a coarse correction
+  T *target, *saved, *free;        // s; before a coarse correction; of the free iterate, with planes and spheres
   const T *inverse, *inertia;      // every `stride` numbers
   const T* mass;                   // by the user's number
   int stride, vertices, components;
@@ -158,9 +258,16 @@ struct BodyState {
   PD_HD Vec3<T> place(int i, const Vec3<T>& displacement) const {
     return read(x, i) + displacement;
   }
+  // The displacement to a place: the bits of the free iterate where it leads there.
+  PD_HD Vec3<T> displacement_to(const Vec3<T>& to, int i) const {
+    const Vec3<T> own = read(free, i), there = place(i, own);
+    const bool same = there.x == to.x && there.y == to.y && there.z == to.z;
+    return same ? own : to - read(x, i);
+  }
   PD_HD T inverse_of(int i) const { return inverse[std::int64_t(i) * stride]; }
+  PD_HD T inertia_of(int i) const { return inertia[std::int64_t(i) * stride]; }
   PD_HD Vertex<Thread<T>, true> vertex(int i) const {
-    return {read(x, i), read(target, i), inertia[std::int64_t(i) * stride], inverse_of(i)};
+    return {read(x, i), read(target, i), inertia_of(i), inverse_of(i)};
   }
 };
 
@@ -179,23 +286,17 @@ struct ContactEnvironment {
   PD_HD int owners() const { return plan.points + plan.edges; }
   PD_HD ContactNumbers& numbers() const { return *a.numbers; }
 
-  PD_HD bool is_stuck(int v) const {
-    bool stuck = false;
-    if (numbers().stuck) {
-      for (int n = a.start[v]; n < a.start[v + 1]; ++n) stuck = stuck || a.margin[n] < T(0);
-    }
-    return stuck;
-  }
+  PD_HD bool is_stuck(int v) const { return a.limits[v] == limits_stuck; }
   // The half-spaces of the corners of a pair.
   PD_HD void keep_spaces(int p) const {
     const ContactPair<T>& pair = a.pair[p];
-    if (pair.plane.frozen) numbers().stuck = 1;
     for (int corner = 0; corner < 4; ++corner) {
       const int n = a.slot[4 * p + corner];
       visit_space(pair.plane, pair.on_a(corner), [&](const Vec3<T>& normal, T bound, T margin) {
         a.space[n] = {normal.x, normal.y, normal.z, bound};
-        a.margin[n] = pair.plane.frozen ? T(-1) : margin;
+        a.margin[n] = margin;
       });
+      raise(a.limits + pair.vertex[corner], int(pair.plane.frozen ? limits_stuck : limits_planes));
     }
   }
   // The force of a pair, by entries; zeros where it does not count.
@@ -207,6 +308,15 @@ struct ContactEnvironment {
       if (counts) push = {force.x, force.y, force.z, pair.near.weight[corner]};
       a.push[a.slot[4 * p + corner]] = push;
     }
+  }
+  // The force of all pairs on a vertex, after keep_pushes.
+  PD_HD Vec3<T> force_on(int v) const {
+    Vec3<T> force = {T(0), T(0), T(0)};
+    for (int n = a.start[v]; n < a.start[v + 1]; ++n) {
+      const Four<T> push = a.push[n];
+      force = multiply_add(push.w, Vec3<T>{push.x, push.y, push.z}, force);
+    }
+    return force;
   }
   // calls visit(normal, bound) for the planes and spheres of the scene
   template <class Visit>

@@ -1,164 +1,127 @@
-// The search of pairs: static trees of boxes with 32 children a node, made anew from their leaves.
-// A thread takes the parts of a surface that may be first in a pair. Pairs are counted, placed by
-// prefix sums, and lie in the order of their keys.
+// The search of pairs: boxes of clusters of sides, tested 32 at a time, body by body.
+//
+// Bodies whose boxes are apart are not asked, nor bodies with themselves whose shape keeps their
+// parts apart. What comes near is kept in a list; only if that is full, boxes are tested again.
+// Pairs are counted, placed by prefix sums, and lie in the order of their keys.
 #pragma once
+#include "solver/contact/clusters.h"
 #include "solver/contact/environment.h"
+#include "solver/contact/shape.h"
 
 namespace pd::inline PD_TARGET {
-
-template <class T>
-struct TreeOfBoxes {
-  const int* order;  // leaves
-  Box<T>* box;
-  int count;
-
-  PD_HD int nodes(int level) const { return ((count - 1) >> (5 * level)) + 1; }
-
-  // boxes of a level from those below
-  template <class Team>
-  PD_HD void refit(const Team& team) const {
-    int below = 0;
-    for (int n = count; n > 1;) {
-      const int nodes = (n + tree_fan - 1) / tree_fan, own = below + n;
-      team.each(nodes, [&](int node) {
-        Box<T> sum = Box<T>::none();
-        const int end = (node + 1) * tree_fan < n ? (node + 1) * tree_fan : n;
-        for (int child = node * tree_fan; child < end; ++child) sum.add(box[below + child]);
-        box[own + node] = sum;
-      });
-      below = own;
-      n = nodes;
-    }
-  }
-};
-
-// A part of a surface on its way through a tree, node by node.
-template <class T>
-struct TreeWalk {
-  const ContactPlan<T>& plan;
-  const TreeOfBoxes<T>* tree;
-  Box<T> box;
-  int owner, least;  // numbers of other parts must be larger
-  int vertex[2];     // of the part
-  int top, level, first, n;
-  bool ended;
-
-  // Tests the next node; returns the number of a leaf whose box meets that of the part, or -1.
-  PD_HD int step() {
-    if (tree->box[first + n].meets(box)) {
-      if (level > 0) {
-        --level;
-        first -= tree->nodes(level);
-        n *= tree_fan;
-        return -1;
-      }
-      const int other = tree->order[n];
-      advance();
-      return other > least && is_apart(other) ? other : -1;
-    }
-    advance();
-    return -1;
-  }
-
- private:
-  PD_HD void advance() {
-    ++n;
-    while (level < top && (n % tree_fan == 0 || n >= tree->nodes(level))) {
-      n = (n - 1) / tree_fan + 1;
-      first += tree->nodes(level);
-      ++level;
-    }
-    ended = level == top && n >= 1;
-  }
-  // Whether the other part has no vertex of this one.
-  PD_HD bool is_apart(int other) const {
-    const bool point = owner < plan.points;
-    const int count = point ? 3 : 2;
-    const int* of = point ? plan.triangle + 3 * other : plan.edge + 2 * other;
-    bool apart = true;
-    for (int c = 0; c < count; ++c) apart = apart && of[c] != vertex[0] && of[c] != vertex[1];
-    return apart;
-  }
-};
 
 template <class T>
 class ContactSearch {
  public:
   using Env = ContactEnvironment<T>;
 
-  PD_HD explicit ContactSearch(const Env& env)
-      : env_(env),
-        triangles_{env.plan.triangle_order, env.a.triangle_box, env.plan.triangles},
-        edges_{env.plan.edge_order, env.a.edge_box, env.plan.edges} {}
+  PD_HD explicit ContactSearch(const Env& env) : env_(env), shapes_(env.plan), boxes_(boxes(env)) {}
 
-  // Boxes of all parts. `box_of(vertex)`, and `reach(vertex)`: by which boxes of its parts are wider.
+  PD_HD const RestShapes<T>& shapes() const { return shapes_; }
+
+  // Once in a step, when it is known what moves by hand.
+  template <class Team>
+  PD_HD void begin(const Team& team) const {
+    const ContactPlan<T>& plan = env_.plan;
+    team.spread(cluster_size * count_all_groups(plan), [&](int n) {
+      env_.a.group[n / cluster_size].set(n % cluster_size, Box<T>::none());
+    });
+    team.each(plan.bodies, [&](int b) { env_.a.by_hand[b] = 1; });
+    team.each(plan.points, [&](int n) {
+      const int v = plan.point[n];
+      if (!env_.held(v)) env_.a.by_hand[plan.body[v]] = 0;
+    });
+  }
+
+  // Fits boxes of the bodies that are asked, and returns whether some are: those with itself[body],
+  // and, `between`, those whose boxes meet. `box_of(vertex)`, and `reach(vertex)`: by which boxes
+  // of its sides are wider.
   template <class Team, class BoxOf, class Reach>
-  PD_HD void refit(const Team& team, const BoxOf& box_of, const Reach& reach) const {
+  PD_HD bool fit(const Team& team, const BoxOf& box_of, const Reach& reach, bool between) const {
     const ContactPlan<T>& plan = env_.plan;
-    team.spread(plan.triangles, [&](int i) {
-      triangles_.box[i] = side(plan.triangle + 3 * triangles_.order[i], 3, box_of, reach);
+    const ContactArrays<T>& a = env_.a;
+    ContactNumbers& numbers = env_.numbers();
+    const auto fit_cluster = [&](int c, const auto& lanes) {
+      const Box<T> hull = boxes_.fit(lanes, c, box_of, reach);
+      if (lanes.leads()) boxes_.tree_of(c).set_hull(c, hull);
+      return hull;
+    };
+    team.each(plan.bodies, [&](int b) { a.body_box[b] = Box<T>::none(); });
+    team.spread(1, [&](int) { numbers.meets = 0; });
+    team.warps(between ? plan.point_clusters : 0, [&](int c, const auto& lanes) {
+      const Box<T> hull = fit_cluster(c, lanes);
+      if (lanes.leads()) extend(a.body_box[plan.cluster_body[c]], hull);
     });
-    team.each(plan.edges, [&](int i) {
-      edges_.box[i] = side(plan.edge + 2 * edges_.order[i], 2, box_of, reach);
+    team.barrier();
+    team.each(plan.bodies, [&](int b) {
+      bool asked = a.itself[b] && !a.by_hand[b];
+      for (int other = 0; between && !asked && other < plan.bodies; ++other)
+        asked = other != b && !(a.by_hand[b] && a.by_hand[other]) &&
+                a.body_box[b].meets(a.body_box[other]);
+      a.wanted[b] = asked;
+      if (asked) numbers.meets = 1;
     });
-    triangles_.refit(team);
-    edges_.refit(team);
+    const bool meets = numbers.meets != 0;
+    if (!meets) {
+      team.barrier();  // all have read
+      return false;
+    }
+    const int fitted = between ? plan.point_clusters : 0;
+    team.warps(plan.clusters - fitted, [&](int n, const auto& lanes) {
+      const int c = fitted + n;
+      if (a.wanted[plan.cluster_body[c]]) {
+        fit_cluster(c, lanes);
+      } else if (lanes.leads()) {
+        boxes_.tree_of(c).set_hull(c, Box<T>::none());
+      }
+    });
+    team.barrier();
+    boxes_.edges.refit(team);
+    boxes_.triangles.refit(team);
+    return true;
   }
 
-  // Calls visit(owner, other, pair) for every pair that counts and whose boxes meet, of the owners that `wants(owner)`.
-  template <class Team, class BoxOf, class Reach, class Wants, class Visit>
-  PD_HD void each_boxed(const Team& team, const BoxOf& box_of, const Reach& reach,
-                        const Wants& wants, const Visit& visit) const {
-    const ContactPlan<T>& plan = env_.plan;
-    team.walk(
-        env_.owners(),
-        [&](int item) {
-          const bool point = item < plan.points;
-          const int own = point ? plan.point_order[item] : plan.edge_order[item - plan.points];
-          const int* const vertex = point ? plan.point + own : plan.edge + 2 * own;
-          const TreeOfBoxes<T>& tree = point ? triangles_ : edges_;
-          TreeWalk<T> walk{plan,
-                           &tree,
-                           {},
-                           point ? own : plan.points + own,
-                           point ? -1 : own,
-                           {vertex[0], vertex[point ? 0 : 1]},
-                           0,
-                           0,
-                           0,
-                           0,
-                           false};
-          walk.ended = tree.count == 0 || !wants(walk.owner);
-          if (walk.ended) return walk;
-          walk.box = side(vertex, point ? 1 : 2, box_of, reach);
-          for (; tree.nodes(walk.top) > 1; ++walk.top) walk.first += tree.nodes(walk.top);
-          walk.level = walk.top;
-          return walk;
-        },
-        [&](int owner, int other) {
-          ContactPair<T> pair = pair_of(owner, other);
-          if (complete(plan, [&](int v) { return env_.held(v); }, pair)) visit(owner, other, pair);
-        });
+  // Calls visit(found) for what fitted boxes that meet: found.each(visit(owner, other)), and
+  // found.each_closest(sides_of(owner, other), places, visit(owner, other, closest)). Owners are
+  // rows of `point`, then edges; of two edges the lesser one. None shares a vertex.
+  template <class Team, class Visit>
+  PD_HD void each_boxed(const Team& team, const Visit& visit) const {
+    team.template walk<T>(boxes_, [&](int cluster, int own, int other) {
+      const bool point = boxes_.has_points(cluster), swaps = !point && other < own;
+      return SidePair{(point ? 0 : env_.plan.points) + (swaps ? other : own), swaps ? own : other};
+    }, visit);
   }
 
-  PD_HD ContactPair<T> pair_of(int owner, int other) const {
+  PD_HD ContactPair<T> sides_of(int owner, int other) const {
     const ContactPlan<T>& plan = env_.plan;
     return owner < plan.points ? pair_of_point(plan, plan.point[owner], other)
                                : pair_of_edges(plan, owner - plan.points, other);
   }
+
+  // Whether the pair counts.
+  PD_HD bool find_pair(int owner, int other, ContactPair<T>& pair) const {
+    pair = sides_of(owner, other);
+    return complete(env_.plan, [&](int v) { return env_.held(v); }, pair);
+  }
+
+  // A list of what came near, as far as there is room; `value`: of the caller
+  PD_HD void list(int owner, int other, T value) const {
+    const int at = count_one(&env_.numbers().listed);
+    if (at >= count_near(env_.plan)) return;
+    env_.a.near_side[at] = {owner, other};
+    env_.a.near_value[at] = value;
+  }
+  PD_HD bool is_whole() const { return env_.numbers().listed <= count_near(env_.plan); }
 
   // Lists the pairs that may come near while no vertex leaves its ball. A ball reaches over what
   // its vertex wants and the thickness. Where that is less than half of the room to the nearest
   // other side, it takes that: no pair more is listed. Forces are those of the list before, or of
   // the history in a `first` search.
   template <class Team>
-  PD_HD void find(const Team& team, bool first) const {
+  PD_CALLED void find(const Team& team, bool first) const {
     const ContactPlan<T>& plan = env_.plan;
     const ContactArrays<T>& a = env_.a;
     ContactNumbers& numbers = env_.numbers();
-    const auto most = [&](int v) { return T(ball_cells) * plan.cell[v]; };
-    const auto box_of = [&](int v) { return Box<T>{a.place[v], a.place[v]}; };
-    const auto reach = [&](int v) { return most(v) + T(0.5) * plan.thickness; };
     const int before = first ? 0 : numbers.pairs;
     team.spread(before, [&](int p) {
       a.known_key[p] = a.pair[p].key;
@@ -166,20 +129,21 @@ class ContactSearch {
     });
     team.spread(plan.vertices, [&](int v) { a.room[v] = T(HUGE_VAL), a.cursor[v] = 0; });
     team.spread(env_.owners(), [&](int n) { a.owner_near[n] = 0, a.owner_start[n] = 0; });
-    team.spread(1, [&](int) { numbers.near = numbers.stuck = 0; });
-    refit(team, box_of, reach);
-    each_boxed(
-        team, box_of, reach, [](int) { return true; },
-        [&](int owner, int, ContactPair<T>& pair) {
-          measure(pair);
-          if (!pair.is_within(most, plan.thickness)) return;
-          for (int v : pair.vertex) lower(a.room + v, pair.near.distance);
-          a.owner_near[owner] = numbers.near = 1;
-        });
+    team.spread(1, [&](int) { numbers.listed = 0; });
+    plan_balls(team);
+    const auto most = [&](int v) { return a.ball_most[plan.body[v]]; };
+    const bool meets = fit(
+        team, [&](int v) { return Box<T>{a.place[v], a.place[v]}; },
+        [&](int v) { return most(v) + T(0.5) * plan.thickness; }, true);
+    if (meets) {
+      each_near(team, most, [&](int owner, int other, T distance) {
+        for (int v : sides_of(owner, other).vertex) lower(a.room + v, distance);
+        list(owner, other, distance);
+      });
+    }
     team.each(plan.vertices, [&](int v) {
-      const Vec3<T> way = a.target[v] - a.place[v];
       const bool held = env_.held(v);
-      const T wanted = T(ball_reach) * square_root(dot(way, way)) + (held ? T(0) : plan.thickness),
+      const T wanted = wanted_reach(v),
               roomy = held ? T(0) : T(ball_room) * (a.room[v] - plan.thickness),
               larger = wanted < roomy ? roomy : wanted, bound = most(v);
       a.ball[v].center = a.place[v];
@@ -187,16 +151,20 @@ class ContactSearch {
       a.ball[v].radius = a.surface[v] ? (bound < larger ? bound : larger) : T(HUGE_VAL);
     });
     const auto radius = [&](int v) { return a.ball[v].radius; };
-    const auto each_listed = [&](const auto& wants, const auto& visit) {
-      each_boxed(team, box_of, reach, wants, [&](int owner, int other, ContactPair<T>& pair) {
-        measure(pair);
-        if (pair.is_within(radius, plan.thickness)) visit(owner, other);
+    const int listed = meets ? numbers.listed : 0;
+    const bool whole = is_whole();
+    const auto each_listed = [&](const auto& visit) {
+      if (!whole) return each_near(team, radius, visit);
+      team.each(listed, [&](int n) {
+        const SidePair of = a.near_side[n];
+        ContactPair<T> pair = sides_of(of.owner, of.other);
+        pair.near.distance = a.near_value[n];
+        if (pair.is_within(radius, plan.thickness)) visit(of.owner, of.other, T(0));
       });
     };
     int found = 0;
-    if (numbers.near) {
-      each_listed([&](int owner) { return a.owner_near[owner] != 0; },
-                  [&](int owner, int) { count_one(a.owner_start + owner); });
+    if (listed > 0) {
+      each_listed([&](int owner, int, T) { count_one(a.owner_start + owner); });
       team.scan(a.owner_start, env_.owners());
       found = a.owner_start[env_.owners()];
     }
@@ -207,24 +175,22 @@ class ContactSearch {
       ++numbers.searches;
     });
     if (count > 0) {
-      team.each(env_.owners(), [&](int n) { a.owner_near[n] = 0; });
-      each_listed([&](int owner) { return a.owner_start[owner] < a.owner_start[owner + 1]; },
-                  [&](int owner, int other) {
-                    const int at = a.owner_start[owner] + count_one(a.owner_near + owner);
-                    a.partner[at] = other;
-                    a.owner[at] = owner;
-                  });
+      each_listed([&](int owner, int other, T) {
+        const int at = a.owner_start[owner] + count_one(a.owner_near + owner);
+        a.partner[at] = other;
+        a.owner[at] = owner;
+      });
       team.each(env_.owners(), [&](int n) {
         int* const partner = a.partner + a.owner_start[n];
         const int own = a.owner_start[n + 1] - a.owner_start[n];
         for (int k = 1; k < own; ++k) place_in_order(partner, k, partner[k]);
       });
     }
-    team.each(count, [&](int p) {
+    team.each(count, [&](int p) { find_pair(a.owner[p], a.partner[p], a.pair[p]); });
+    team.each_closest(count, [&](int p) -> const auto& { return a.pair[p]; }, a.place,
+                      [&](int p, const Closest<T>& near) {
       ContactPair<T>& pair = a.pair[p];
-      pair = pair_of(a.owner[p], a.partner[p]);
-      complete(plan, [&](int v) { return env_.held(v); }, pair);
-      measure(pair);
+      pair.near = near;
       make_plane(pair, a.place, a.target, pair.near, Vec3<T>{});
       pair.normal = pair.normal_at(pair.near);
       pair.force = force_of(pair.key, first, before);
@@ -235,22 +201,78 @@ class ContactSearch {
   }
 
  private:
-  template <class BoxOf, class Reach>
-  PD_HD static Box<T> side(const int* vertex, int count, const BoxOf& box_of, const Reach& reach) {
-    Box<T> box = Box<T>::none();
-    T widest(0);
-    for (int n = 0; n < count; ++n) {
-      box.add(box_of(vertex[n]));
-      const T own = reach(vertex[n]);
-      widest = widest < own ? own : widest;
-    }
-    return box.widened(widest);
+  PD_HD static ClusterBoxes<T> boxes(const Env& env) {
+    const ContactPlan<T>& plan = env.plan;
+    const ContactArrays<T>& a = env.a;
+    const int points = plan.point_clusters, edges = plan.edge_clusters;
+    Cluster<T>*const of_edges = a.group + count_groups(points),
+               *const of_triangles = of_edges + count_groups(edges);
+    return {plan.leaves,
+            plan.cluster_body,
+            a.cluster,
+            {a.group, 0, points},
+            {of_edges, points, edges},
+            {of_triangles, points + edges, plan.clusters - points - edges},
+            a.itself,
+            a.wanted,
+            a.by_hand};
   }
 
-  PD_HD void measure(ContactPair<T>& pair) const {
-    Vec3<T> corner[4];
-    pair.corners(env_.a.place, corner);
-    pair.near = closest_points(pair.edges, corner);
+  PD_HD static void extend(Box<T>& box, const Box<T>& by) {
+    lower(&box.low.x, by.low.x), lower(&box.low.y, by.low.y), lower(&box.low.z, by.low.z);
+    raise(&box.high.x, by.high.x), raise(&box.high.y, by.high.y), raise(&box.high.z, by.high.z);
+  }
+
+  // What a vertex wants to reach, with a margin.
+  PD_HD T wanted_reach(int v) const {
+    const Vec3<T> way = env_.a.target[v] - env_.a.place[v];
+    return multiply_add(T(ball_reach), square_root(dot(way, way)),
+                        env_.held(v) ? T(0) : env_.plan.thickness);
+  }
+
+  // The largest balls of every body. If they may be so small that its own parts cannot meet, these
+  // are not asked.
+  template <class Team>
+  PD_HD void plan_balls(const Team& team) const {
+    const ContactPlan<T>& plan = env_.plan;
+    const ContactArrays<T>& a = env_.a;
+    team.groups(plan.bodies, [&](int b, const auto& group) {
+      const int begin = plan.surface_start[b], end = plan.surface_start[b + 1];
+      T most = begin < end ? T(ball_cells) * plan.cell[plan.point[begin]] : T(0);
+      bool itself = plan.touches_itself[b] != 0;
+      if (itself && !a.by_hand[b] && plan.rest_apart[b] > T(0)) {
+        double least[1] = {0};
+        group.least_range(
+            begin, end,
+            [&](int n, double (&low)[1]) {
+              const double own = -double(wanted_reach(plan.point[n]));
+              low[0] = own < low[0] ? own : low[0];
+            },
+            least);
+        const T wanted = T(-least[0]), needed = wanted < most ? wanted : most,
+                room = T(0.5) * (shapes_.apart(group, b, a.place) -
+                                 T(1.0 + slack_share) * plan.thickness);
+        if (room >= needed) {
+          itself = false;
+          most = room < most ? room : most;
+        }
+      }
+      if (group.leads()) a.itself[b] = itself, a.ball_most[b] = most;
+    });
+  }
+
+  // Calls visit(owner, other, distance) for pairs that count within reach of balls.
+  template <class Team, class Radius, class Visit>
+  PD_HD void each_near(const Team& team, const Radius& radius, const Visit& visit) const {
+    each_boxed(team, [&](const auto& found) {
+      found.each_closest([&](int owner, int other) { return sides_of(owner, other); },
+                         env_.a.place, [&](int owner, int other, const Closest<T>& near) {
+        ContactPair<T> pair = sides_of(owner, other);
+        pair.near.distance = near.distance;
+        if (pair.is_within(radius, env_.plan.thickness) && find_pair(owner, other, pair))
+          visit(owner, other, near.distance);
+      });
+    });
   }
 
   // Inserts a number among `count` increasing ones.
@@ -297,7 +319,8 @@ class ContactSearch {
   }
 
   const Env& env_;
-  TreeOfBoxes<T> triangles_, edges_;
+  const RestShapes<T> shapes_;
+  const ClusterBoxes<T> boxes_;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -1,6 +1,5 @@
 // Numbers that several threads of an environment change at a time. The result depends on no order:
-// counts, and the least or largest of numbers that are not negative, whose bits are ordered as
-// integers. On the host one thread runs alone.
+// counts, and the least or largest of numbers. On the host one thread runs alone.
 #pragma once
 #include "math/scalar.h"
 
@@ -14,6 +13,17 @@ PD_HD int count_one(int* to) {
   return atomicAdd(to, 1);
 #else
   return (*to)++;
+#endif
+}
+
+// Whether it was 0; then it is 1.
+PD_HD bool take_first(int* to) {
+#if defined(__CUDA_ARCH__)
+  return atomicExch(to, 1) == 0;
+#else
+  const bool first = *to == 0;
+  *to = 1;
+  return first;
 #endif
 }
 
@@ -32,31 +42,54 @@ PD_HD void raise(int* to, int value) {
 #endif
 }
 
-// `value` and the number at hand are not negative, nor -0
+// Numbers of any sign, none NaN: bits of positive ones are ordered as integers, of negative ones the
+// other way round.
 PD_HD void lower(float* to, float value) {
 #if defined(__CUDA_ARCH__)
-  atomicMin(reinterpret_cast<int*>(to), __float_as_int(value));
+  const float own = value + 0.0f;  // no -0
+  if (own >= 0.0f) {
+    atomicMin(reinterpret_cast<int*>(to), __float_as_int(own));
+  } else {
+    atomicMax(reinterpret_cast<unsigned*>(to), __float_as_uint(own));
+  }
 #else
   if (value < *to) *to = value;
 #endif
 }
 PD_HD void lower(double* to, double value) {
 #if defined(__CUDA_ARCH__)
-  atomicMin(reinterpret_cast<long long*>(to), __double_as_longlong(value));
+  const double own = value + 0.0;
+  if (own >= 0.0) {
+    atomicMin(reinterpret_cast<long long*>(to), __double_as_longlong(own));
+  } else {
+    atomicMax(reinterpret_cast<unsigned long long*>(to),
+              static_cast<unsigned long long>(__double_as_longlong(own)));
+  }
 #else
   if (value < *to) *to = value;
 #endif
 }
 PD_HD void raise(float* to, float value) {
 #if defined(__CUDA_ARCH__)
-  atomicMax(reinterpret_cast<int*>(to), __float_as_int(value));
+  const float own = value + 0.0f;
+  if (own >= 0.0f) {
+    atomicMax(reinterpret_cast<int*>(to), __float_as_int(own));
+  } else {
+    atomicMin(reinterpret_cast<unsigned*>(to), __float_as_uint(own));
+  }
 #else
   if (*to < value) *to = value;
 #endif
 }
 PD_HD void raise(double* to, double value) {
 #if defined(__CUDA_ARCH__)
-  atomicMax(reinterpret_cast<long long*>(to), __double_as_longlong(value));
+  const double own = value + 0.0;
+  if (own >= 0.0) {
+    atomicMax(reinterpret_cast<long long*>(to), __double_as_longlong(own));
+  } else {
+    atomicMin(reinterpret_cast<unsigned long long*>(to),
+              static_cast<unsigned long long>(__double_as_longlong(own)));
+  }
 #else
   if (*to < value) *to = value;
 #endif

@@ -3,7 +3,8 @@
 //   start; [coarse correction] go_first; for k: [free iterate, energy] iterate(k);
 //   [coarse correction] go_last; finish; write
 #pragma once
-#include "solver/contact/approach.h"
+#include "solver/contact/coarse.h"
+#include "solver/contact/prox.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -13,14 +14,16 @@ class ContactSteps {
   using Env = ContactEnvironment<T>;
 
   PD_HD explicit ContactSteps(const Env& env)
-      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env) {}
+      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env), correction_(env, search_), prox_(env) {}
 
   // A step begins at the places of bodies; poses are those of colliders, actual ones and those of the step's end.
   template <class Team>
   PD_HD void start(const Team& team) const {
-    team.spread(plan_.vertices, [&](int v) { a_.surface[v] = 0; });
+    team.spread(plan_.vertices,
+                [&](int v) { a_.surface[v] = 0, a_.limits[v] = a_.touched[v] = 0; });
     team.spread(body_.vertices, [&](int i) {
       const int v = body_.order[i];
+      a_.inside[v] = i, a_.component[v] = body_.component[i];
       a_.place[v] = a_.begin[v] = body_.place(i, {T(0), T(0), T(0)});
       a_.inverse[v] = body_.inverse_of(i);
       a_.held[v] = !(body_.inverse_of(i) > T(0));
@@ -55,6 +58,7 @@ class ContactSteps {
       numbers.known = begin;
       env_.numbers() = numbers;
     });
+    search_.begin(team);
   }
 
   // Approach, search and the first iterate, as near to the corrected guess as the promise allows.
@@ -76,6 +80,7 @@ class ContactSteps {
       });
     });
     want(team, body_.u);
+    team.barrier();
     approach.move(team);
     search_.find(team, true);
     // What was stopped starts where it was: nearer to its guess it would only be squashed.
@@ -101,10 +106,48 @@ class ContactSteps {
       });
     });
     want(team, body_.u);
+    team.barrier();
     watch(team, pairs, false);
     prepare(team, iterations);
     double none[2];
     go(team, false, none);
+  }
+
+  // The coarse correction of bodies in contact. In between, where planes and spheres exist, the runner keeps their forces
+  // at the gradient by the targets of now. Returns whether there is something to correct.
+  template <class Team>
+  PD_HD bool begin_correction(const Team& team) const {
+    if (body_.components == 0) return false;
+    look(team, env_.numbers().pairs);
+    correction_.begin(team);
+    if (!env_.numbers().corrects) return false;
+    if (env_.walls.exist()) correction_.shift_targets(team);
+    return true;
+  }
+
+  // `forces(i)`: those that the runner has kept. Returns whether a motion was cut.
+  template <class Team, class Forces>
+  PD_HD bool correct(const Team& team, const Forces& forces) const {
+    ContactNumbers& numbers = env_.numbers();
+    if (env_.walls.exist()) correction_.restore_targets(team);
+    correction_.move(team, forces);
+    const bool cuts = numbers.cuts != 0, pushes = numbers.pushes != 0;
+    team.spread(1, [&](int) { numbers.checked = numbers.cut = 0; });
+    team.spread(plan_.vertices, [&](int v) { a_.cut[v] = 0, a_.limits[v] = limits_none; });
+    team.each(body_.vertices, [&](int i) { leave_walls(i); });
+    if (numbers.leaves) search_.find(team, false);
+    const int pairs = numbers.pairs;
+    look(team, pairs);
+    team.each(pairs, [&](int p) {
+      renew(p, a_.place);
+      if (pushes) renew(p, a_.target);
+    });
+    if (pushes) {
+      double none[2];
+      go(team, false, none);
+    }
+    correction_.end(team);
+    return cuts;
   }
 
   // An iteration of a step, from the free iterate without contact. `energy`: E at the iterate, if
@@ -125,6 +168,7 @@ class ContactSteps {
     Merits merits{};
     if (pairs == 0 && !of.guards) {
       team.spread(1, [&](int) { env_.numbers().cut = 0; });
+      team.spread(plan_.vertices, [&](int v) { a_.limits[v] = limits_none; });
       team.spread(body_.vertices, [&](int i) {
         want_vertex(i, body_.free);
         leave_walls(i);
@@ -135,10 +179,10 @@ class ContactSteps {
         watch_vertex(plan_.body_vertices + n);
       });
     } else {
-      team.spread(pairs, [&](int p) { look(a_.pair[p]); });
       want(team, body_.free);
+      look(team, pairs);
       if (of.guards) merits = check(team, pairs, of.energy);
-      if (pairs > 0) prox(team, pairs, of.c);
+      if (pairs > 0) prox_.run(team, of.c);
       watch(team, pairs, true);
     }
     prepare(team, k);
@@ -149,24 +193,23 @@ class ContactSteps {
   // whether all go as they want
   PD_HD bool is_at_rest() const { return !env_.numbers().cut && !env_.numbers().waits; }
 
+  // whether pairs exceed the capacity
+  PD_HD bool overflows() const { return env_.numbers().most_pairs > plan_.capacity; }
+
   // At the end of a step: forces on every vertex [vertices, 3] N.
   template <class Team>
   PD_HD void finish(const Team& team, T* forces) const {
     const int pairs = env_.numbers().pairs;
+    look(team, pairs);
     team.each(plan_.colliders + 2,
               [&](int n) { a_.most[n] = n < plan_.colliders + 1 ? T(0) : T(HUGE_VAL); });
     team.each(pairs, [&](int p) {
-      ContactPair<T>& pair = a_.pair[p];
-      look(pair);
+      const ContactPair<T>& pair = a_.pair[p];
       lower(a_.most + plan_.colliders + 1, pair.near.distance / pair.thickness);
       env_.keep_pushes(p, true);
     });
     team.each(plan_.vertices, [&](int v) {
-      Vec3<T> force = {T(0), T(0), T(0)};
-      for (int n = a_.start[v]; n < a_.start[v + 1]; ++n) {
-        const Four<T> push = a_.push[n];
-        force = multiply_add(push.w, Vec3<T>{push.x, push.y, push.z}, force);
-      }
+      const Vec3<T> force = env_.force_on(v);
       T* const to = forces + 3 * std::int64_t(v);
       to[0] = force.x, to[1] = force.y, to[2] = force.z;
       if (!env_.held(v)) return;
@@ -187,7 +230,7 @@ class ContactSteps {
   template <class Team>
   PD_HD void write(const Team& team, const Output& to) const {
     const ContactNumbers& numbers = env_.numbers();
-    const bool overflows = numbers.most_pairs > plan_.capacity;
+    const bool overflows = this->overflows();
     const int pairs = overflows ? 0 : numbers.pairs;
     team.each(pairs, [&](int p) { a_.entry[p] = a_.pair[p].has_force(); });
     team.scan(a_.entry, pairs);
@@ -237,10 +280,8 @@ class ContactSteps {
   PD_HD void restore_touching(const Team& team, const Each& each_touching) const {
     if (body_.components == 0) return;
     team.each(body_.components, [&](int g) { a_.touches[g] = 0; });
-    // components by the user's numbers
-    team.each(body_.vertices, [&](int i) { a_.cursor[body_.order[i]] = body_.component[i]; });
     each_touching([&](int v) {
-      const int g = v < plan_.body_vertices ? a_.cursor[v] : -1;
+      const int g = v < plan_.body_vertices ? a_.component[v] : -1;
       if (g >= 0) a_.touches[g] = 1;
     });
     team.each(body_.vertices, [&](int i) {
@@ -253,14 +294,16 @@ class ContactSteps {
   // Targets of the next move: displacements of bodies, and the goals of what moves by hand.
   PD_HD void want_vertex(int i, const T* displacement) const {
     const int v = body_.order[i];
-    a_.target[v] = env_.held(v) ? a_.goal[v] : body_.place(i, BodyState<T>::read(displacement, i));
+    const Vec3<T> u = BodyState<T>::read(displacement, i);
+    BodyState<T>::write(body_.free, i, u);
+    a_.target[v] = env_.held(v) ? a_.goal[v] : body_.place(i, u);
   }
   template <class Team>
   PD_HD void want(const Team& team, const T* displacement) const {
     team.spread(1, [&](int) { env_.numbers().cut = 0; });
-    team.spread(plan_.vertices, [&](int v) { a_.touched[v] = 0; });
+    team.spread(plan_.vertices, [&](int v) { a_.limits[v] = limits_none; });
     team.spread(body_.vertices, [&](int i) { want_vertex(i, displacement); });
-    team.each(plan_.vertices - plan_.body_vertices, [&](int n) {
+    team.spread(plan_.vertices - plan_.body_vertices, [&](int n) {
       a_.target[plan_.body_vertices + n] = a_.goal[plan_.body_vertices + n];
     });
   }
@@ -269,16 +312,22 @@ class ContactSteps {
   PD_HD void leave_walls(int i) const {
     if (!env_.walls.exist()) return;
     Vec3<T>& target = a_.target[body_.order[i]];
-    const Vec3<T> u = target - BodyState<T>::read(body_.x, i);
-    target = body_.place(i, body_.vertex(i).project(env_.walls, u, BodyState<T>::read(body_.u, i)));
+    const Vec3<T> u = body_.vertex(i).project(env_.walls, body_.displacement_to(target, i),
+                                              BodyState<T>::read(body_.u, i));
+    BodyState<T>::write(body_.free, i, u);
+    target = body_.place(i, u);
   }
 
-  // Closest points and normal at the present iterate.
-  PD_HD void look(ContactPair<T>& pair) const {
-    Vec3<T> corner[4];
-    pair.corners(a_.place, corner);
-    pair.near = closest_points(pair.edges, corner);
-    pair.normal = pair.normal_at(pair.near);
+  // Closest points and normals at the present iterate.
+  template <class Team>
+  PD_HD void look(const Team& team, int pairs) const {
+    team.each_closest(
+        pairs, [&](int p) -> const auto& { return a_.pair[p]; }, a_.place,
+        [&](int p, const Closest<T>& near) {
+          ContactPair<T>& pair = a_.pair[p];
+          pair.near = near;
+          pair.normal = pair.normal_at(near);
+        });
   }
 
   // E + psi at the last check and now, both by the list and the multipliers of now.
@@ -287,92 +336,27 @@ class ContactSteps {
     ContactNumbers& numbers = env_.numbers();
     const bool checked = numbers.checked != 0;
     double sums[2] = {numbers.checked_energy, energy};
+    const auto psi = [&](const ContactPair<T>& pair, const Vec3<T>* places, const Closest<T>& at) {
+      if (!(pair.force.normal > T(0)) && !(at.distance < pair.thickness)) return 0.0;
+      return augmented_lagrangian(pair.force, pair.yielding(a_.inverse), pair.thickness,
+                                  pair.friction, at.distance,
+                                  pair.template slip<const Vec3<T>*>(places, a_.begin, at));
+    };
+    if (checked) {
+      team.each_closest(
+          pairs, [&](int p) -> const auto& { return a_.pair[p]; }, a_.checked,
+          [&](int p, const Closest<T>& near) { a_.radius[p] = psi(a_.pair[p], a_.checked, near); });
+    }
     team.sum(
         pairs,
         [&](int p, double (&sum)[2]) {
-          const ContactPair<T>& pair = a_.pair[p];
-          const T yielding = pair.yielding(a_.inverse);
-          const auto psi = [&](const Vec3<T>* places, const Closest<T>& at) {
-            return augmented_lagrangian(pair.force, yielding, pair.thickness, pair.friction,
-                                        at.distance,
-                                        pair.template slip<const Vec3<T>*>(places, a_.begin, at));
-          };
-          if (checked) {
-            Vec3<T> corner[4];
-            pair.corners(a_.checked, corner);
-            sum[0] += psi(a_.checked, closest_points(pair.edges, corner));
-          }
-          sum[1] += psi(a_.place, pair.near);
+          if (checked) sum[0] += a_.radius[p];
+          sum[1] += psi(a_.pair[p], a_.place, a_.pair[p].near);
         },
         sums);
     team.spread(plan_.vertices, [&](int v) { a_.checked[v] = a_.place[v]; });
     team.once([&] { numbers.checked_energy = energy, numbers.checked = 1; });
     return {sums[0], sums[1], checked};
-  }
-
-  // The proximal step: multipliers in the metric of D, and what they move. c = theta omega.
-  template <class Team>
-  PD_HD void prox(const Team& team, int pairs, T c) const {
-    ContactNumbers& numbers = env_.numbers();
-    team.each(pairs, [&](int p) {
-      ContactPair<T>& pair = a_.pair[p];
-      bool active = false;
-      if (pair.freedom(a_.inverse) > T(least_yield)) {
-        Vec3<T> corner[4];
-        pair.corners(a_.target, corner);
-        const bool touches = dot(pair.normal, combined(pair.near.weight, corner)) < pair.thickness;
-        active = touches || pair.force.normal > T(0);
-      } else {
-        pair.force = {};  // nothing can yield
-      }
-      if (active || a_.active[p]) env_.keep_pushes(p, active);
-      a_.active[p] = active;
-      if (!active) return;
-      numbers.active = 1;
-      for (int v : pair.vertex) a_.touched[v] = 1;
-    });
-    if (!numbers.active) return;
-    push(team, c, true, false);
-    for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
-      team.each(pairs, [&](int p) {
-        if (!a_.active[p]) return;
-        ContactPair<T>& pair = a_.pair[p];
-        if (sweep == 0) {
-          Vec3<T> before[4];
-          pair.corners(a_.begin, before);
-          a_.sweep[p] = {T(1) / (c * row_bound(pair, a_.weight, a_.inverse)),
-                         combined(pair.near.weight, before)};
-        }
-        Vec3<T> between[4];
-        pair.corners(a_.shift, between);
-        const PairSweep<T> of = a_.sweep[p];
-        pair.force = advance(pair.force, of.beta, pair.thickness, pair.friction, pair.normal,
-                             combined(pair.near.weight, between), of.before);
-        env_.keep_pushes(p, true);
-      });
-      push(team, c, false, sweep + 1 == contact_sweeps);
-    }
-  }
-
-  // Targets, shifted by the forces of active pairs. `first`: with S of every vertex; `last`: they become the targets.
-  template <class Team>
-  PD_HD void push(const Team& team, T c, bool first, bool last) const {
-    team.each(plan_.vertices, [&](int v) {
-      if (!a_.touched[v]) return;
-      const int begin = a_.start[v], end = a_.start[v + 1];
-      Vec3<T> shift = a_.target[v];
-      const T inverse = a_.inverse[v];
-      T weight(0);
-      PD_UNROLL_4
-      for (int n = begin; n < end; ++n) {
-        const Four<T> of = a_.push[n];
-        weight = weight + absolute(of.w);
-        shift = multiply_add(c * of.w * inverse, Vec3<T>{of.x, of.y, of.z}, shift);
-      }
-      a_.shift[v] = shift;
-      if (first) a_.weight[v] = weight;
-      if (last) a_.target[v] = shift;
-    });
   }
 
   // Finds whether a vertex wants to leave its ball, and whether a pair has a force. `walls`: targets leave them first
@@ -409,12 +393,15 @@ class ContactSteps {
       return;
     }
     team.spread(1, [&](int) { numbers.waits = outside; });
-    team.each(pairs, [&](int p) {
-      ContactPair<T>& pair = a_.pair[p];
-      if (!breaks(pair, a_.target)) return;
-      make_plane(pair, a_.place, a_.target, pair.near, pair.plane.normal);
-      env_.keep_spaces(p);
-    });
+    team.each(pairs, [&](int p) { renew(p, a_.target); });
+  }
+
+  // Makes the plane of a pair anew at the present iterate if places do not let it be.
+  PD_HD void renew(int p, const Vec3<T>* to) const {
+    ContactPair<T>& pair = a_.pair[p];
+    if (!breaks(pair, to)) return;
+    make_plane<T, const Vec3<T>*>(pair, a_.place, to, pair.near, pair.plane.normal);
+    env_.keep_spaces(p);
   }
 
   PD_HD void cut(int v) const {
@@ -434,7 +421,7 @@ class ContactSteps {
       const int v = body_.order[i];
       move_vertex(v);
       const Vec3<T> u = BodyState<T>::read(body_.u, i),
-                    next = a_.place[v] - BodyState<T>::read(body_.x, i), way = next - u;
+                    next = body_.displacement_to(a_.place[v], i), way = next - u;
       BodyState<T>::write(body_.u, i, next);
       BodyState<T>::write(body_.before, i, a_.cut[v] ? next : u);
       if (!measures) return;
@@ -446,7 +433,8 @@ class ContactSteps {
     // all have decided by them
     team.spread(1, [&](int) {
       ContactNumbers& numbers = env_.numbers();
-      numbers.active = numbers.outside = numbers.loaded = 0;
+      numbers.active = numbers.moved = numbers.outside = numbers.loaded = 0;
+      for (int& change : numbers.changes) change = 0;
     });
     if (measures) {
       team.sum(body_.vertices, move, sums);
@@ -475,6 +463,11 @@ class ContactSteps {
       count_one(&env_.numbers().frozen);
       return;
     }
+    Vec3<T> inside = a_.target[v];
+    if (a_.limits[v] == limits_none && !move_into(a_.ball[v], inside)) {
+      a_.place[v] = a_.target[v];  // planes and spheres of the scene have moved it
+      return;
+    }
     const LimitedPlace<T> to = limit(a_.target[v], from, a_.ball[v],
                                      [&](const auto& visit) { env_.each_space(v, visit); });
     a_.place[v] = to.place;
@@ -496,6 +489,7 @@ class ContactSteps {
     const auto try_shares = [&](bool all) {
       team.each(own, [&](int n) {
         const int v = plan_.body_vertices + n, c = plan_.collider[v];
+        if (a_.hand[c].is_there()) return;
         if (all && env_.is_stuck(v)) {
           raise(a_.barred + c, 2);
         } else if ((all || a_.share[c] < a_.bound[c]) && a_.barred[c] == 0 &&
@@ -535,6 +529,8 @@ class ContactSteps {
   const ContactArrays<T>& a_;
   const BodyState<T>& body_;
   const ContactSearch<T> search_;
+  const ContactCorrection<T> correction_;
+  const ContactProx<T> prox_;
 };
 
 }  // namespace pd::inline PD_TARGET

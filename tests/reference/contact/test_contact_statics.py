@@ -20,36 +20,35 @@ def test_a_cube_at_rest_on_a_mesh_plane() -> None:
 def test_a_cube_at_rest_on_another_one() -> None:
     """The upper one is carried by forces of 9.81 N, the lower one by the ground."""
     case = stack(2, friction=0.5)
-    step = case.last(20, 64)
+    step = case.last(20, 32)
     upper = case.scene.surfaces.body == 1
     assert float(step.forces[upper, 1].sum()) == pytest.approx(G, rel=1e-3)
     assert float(step.velocities.norm(dim=1).max()) < 1e-2
 
 
-@pytest.mark.parametrize("iterations", [16, 32])
-def test_a_block_sticks_on_a_slope(iterations: int) -> None:
+def test_a_block_sticks_on_a_slope() -> None:
     """tan 20 degrees < .5: forces of the last step carry it; without them it would creep."""
-    step = slope(20.0, 0.5).last(30, iterations)
+    step = slope(20.0, 0.5, cells=2).last(30, 16)
     assert float(step.velocities.norm(dim=1).max()) < 1e-5
 
 
 @pytest.mark.parametrize(("degrees", "friction"), [(30.0, 0.5), (20.0, 0.3)])
 def test_a_block_slides_down_a_slope(degrees: float, friction: float) -> None:
-    """k h g (sin a - mu cos a) after k steps, and what parts that stick at first lend it: .335 and .296."""
-    case = slope(degrees, friction)
-    step = case.last(30, 64)
+    """k h g (sin a - mu cos a) after k steps, and what parts that stick at first lend it."""
+    case = slope(degrees, friction, cells=2)
+    step = case.last(20, 32)
     angle = math.radians(degrees)
-    rigid = 30 * H * G * (math.sin(angle) - friction * math.cos(angle))
+    rigid = 20 * H * G * (math.sin(angle) - friction * math.cos(angle))
     speed = float(torch.tensor(mean_of(case, step.velocities)).norm())
     assert rigid < speed < 1.03 * rigid
 
 
 def test_a_block_stops() -> None:
     """2 m/s, mu = .4: it loses h mu g a step, 2 - 30 h mu g after 30, by pairs that are new in every step."""
-    case = slope(0.0, 0.4, speed=2.0)
+    case = slope(0.0, 0.4, speed=2.0, cells=2)
     start = mean_of(case, case.scene.surfaces.rest[: case.scene.count])[0]
     way = 0.0
-    for number, step in enumerate(case.steps(32, 128)):
+    for number, step in enumerate(case.steps(32, 64)):
         speed = 2.0 - (number + 1) * H * 0.4 * G
         if number < 30:
             way += H * speed
@@ -64,10 +63,10 @@ def test_a_block_stops() -> None:
     assert abs(mean_of(case, step.velocities)[0]) < 0.02
 
 
-@pytest.mark.parametrize(("friction", "lifted"), [(0.8, 0.1), (0.0, 0.0)])
-def test_a_gripper(friction: float, lifted: float) -> None:
-    """By .1 m to 1 mm with friction; without it the cube stays down: the control."""
+@pytest.mark.parametrize(("friction", "steps", "lifted"), [(0.8, 50, 0.1), (0.0, 30, 0.0)])
+def test_a_gripper(friction: float, steps: int, lifted: float) -> None:
+    """By .1 m to 1 mm with friction; without it the cube stays down, fingers 4 cm above: the control."""
     case = gripper(friction, 2)
-    step = case.last(60, 16)
+    step = case.last(steps, 16)
     assert mean_of(case, step.positions)[1] - 0.025 == pytest.approx(lifted, abs=1e-3)
     assert float(step.held_back.max()) == 0.0

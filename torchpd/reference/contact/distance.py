@@ -44,23 +44,18 @@ def point_triangle(corners: Tensor) -> Tensor:
     if not len(corners):
         return corners.new_zeros((0, 4))
     arms = corners[:, 1:] - corners[:, :1]
-    candidates = []
-    for i, j in ((0, 1), (1, 2), (2, 0)):
-        along = corners[:, 1 + j] - corners[:, 1 + i]
-        share = _share(-_dot(arms[:, i], along), _dot(along, along))
-        on_edge = arms.new_zeros(arms.shape[:2])
-        on_edge[:, i], on_edge[:, j] = 1.0 - share, share
-        candidates.append(on_edge)
-    normal = torch.linalg.cross(corners[:, 2] - corners[:, 1], corners[:, 3] - corners[:, 1])
-    areas = torch.stack(
-        [_dot(torch.linalg.cross(arms[:, (k + 1) % 3], arms[:, (k + 2) % 3]), normal) for k in range(3)], dim=1
-    )
+    after, last = [1, 2, 0], [2, 0, 1]
+    along = corners[:, [2, 3, 1]] - corners[:, 1:]
+    shares = _share(-_dot(arms, along), _dot(along, along))
+    # the edge from corner k to the next one has its weights in these two columns of row k
+    candidates = torch.cat([torch.diag_embed(1.0 - shares) + torch.diag_embed(shares)[:, :, last], arms[:, :1]], dim=1)
+    normal = torch.linalg.cross(along[:, 0], along[:, 1])
+    areas = _dot(torch.linalg.cross(arms[:, after], arms[:, last]), normal[:, None])
     inside = (areas >= 0.0).all(dim=1) & (areas.sum(dim=1) > 0.0)
-    areas = torch.where(inside[:, None], areas, candidates[0])
-    candidates.append(areas / areas.sum(dim=1, keepdim=True))
-    among = torch.stack(candidates, dim=1)
-    least = ((among[:, :, :, None] * arms[:, None]).sum(dim=2) ** 2).sum(dim=2).argmin(dim=1)
-    chosen = among[torch.arange(len(among)), least]
+    areas = torch.where(inside[:, None], areas, candidates[:, 0])
+    candidates[:, 3] = areas / areas.sum(dim=1, keepdim=True)
+    least = ((candidates[:, :, :, None] * arms[:, None]).sum(dim=2) ** 2).sum(dim=2).argmin(dim=1)
+    chosen = candidates[torch.arange(len(arms)), least]
     return torch.cat([torch.ones_like(chosen[:, :1]), -chosen], dim=1)
 
 
@@ -73,8 +68,8 @@ def edge_edge(corners: Tensor) -> Tensor:
     zero, one = torch.zeros_like(a), torch.ones_like(a)
     ends = [(zero, _share(f, e)), (one, _share(f + b, e)), (_share(-c, a), zero), (_share(b - c, a), one)]
     # (d1 x d2) . (d2 x r) / |d1 x d2|^2: differences of dot products would cancel for nearly parallel edges
-    normal = _exact_cross(first, second)
-    t = _share(b * _share(_dot(normal, _exact_cross(second, r)), _dot(normal, normal)) + f, e)
+    normal, turned = _exact_cross(torch.stack([first, second]), torch.stack([second, r])).unbind(0)
+    t = _share(b * _share(_dot(normal, turned), _dot(normal, normal)) + f, e)
     ends.append((_share(b * t - c, a), t))
     s, t = (torch.stack(of, dim=1) for of in zip(*ends, strict=True))
     between = r[:, None] + s[:, :, None] * first[:, None] - t[:, :, None] * second[:, None]
@@ -89,25 +84,25 @@ def _dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def _exact_cross(one: Tensor, other: Tensor) -> Tensor:
-    """Cross products [m, 3], every component to about one rounding."""
-    (a, b, c), (x, y, z) = one.unbind(1), other.unbind(1)
+    """Cross products [..., 3], every component to about one rounding."""
+    after, last = [1, 2, 0], [2, 0, 1]
+    halves = *_halves(one), *_halves(other)
+    product, lost = _product(*(half[..., of] for half, of in zip(halves, (after, after, last, last), strict=True)))
+    less, left = _product(*(half[..., of] for half, of in zip(halves, (last, last, after, after), strict=True)))
+    return (product - less) + (lost - left)
 
-    def difference(p: Tensor, q: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        return (p * q - u * v) + (_lost(p, q) - _lost(u, v))
 
-    return torch.stack([difference(b, z, c, y), difference(c, x, a, z), difference(a, y, b, x)], dim=1)
+def _halves(number: Tensor) -> tuple[Tensor, Tensor]:
+    """The higher half of the digits, and what is left."""
+    scaled = (2.0**27 + 1.0 if number.dtype == torch.float64 else 2.0**12 + 1.0) * number
+    high = scaled - (scaled - number)
+    return high, number - high
 
 
-def _lost(p: Tensor, q: Tensor) -> Tensor:
-    """p q less its rounding to p * q, by halves of the digits (Dekker 1971)."""
-    splitter = 2.0**27 + 1.0 if p.dtype == torch.float64 else 2.0**12 + 1.0
-    halves = []
-    for number in (p, q):
-        scaled = splitter * number
-        high = scaled - (scaled - number)
-        halves.append((high, number - high))
-    (ph, pl), (qh, ql) = halves
-    return ((ph * qh - p * q) + ph * ql + pl * qh) + pl * ql
+def _product(ph: Tensor, pl: Tensor, qh: Tensor, ql: Tensor) -> tuple[Tensor, Tensor]:
+    """p q of numbers in halves, and what its rounding has lost (Dekker 1971)."""
+    product = (ph + pl) * (qh + ql)
+    return product, ((ph * qh - product) + ph * ql + pl * qh) + pl * ql
 
 
 def _share(part: Tensor, whole: Tensor) -> Tensor:

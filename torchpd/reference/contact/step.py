@@ -48,7 +48,7 @@ PAUSE = 5  # least iterations between searches: a guard that every search blinds
 SWEEPS = 8  # with 4 an edge that lies on an edge cycles
 PASSES = 64  # of a coarse correction; most of them take 5 to 30
 TRIALS = 4  # of a coarse correction whose motions are cut
-EVERY = 8  # iterations between coarse corrections
+FIRST = 8  # iterations before the first coarse correction between; then their number doubles
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def contact_step(
     if observe is not None:
         observe(0, run.current)
     for k in range(iterations):
-        if k and k % EVERY == 0 and iterations - k > 2:
+        if k >= FIRST and k & (k - 1) == 0 and iterations - k > 2:
             run.correct()
         run.iterate(k)
         if observe is not None:
@@ -252,8 +252,8 @@ class _Run:
         component = torch.full((len(x),), -1)
         component[: scene.count] = torch.tensor(problem.values.component)
         component[scene.count :] -= 1 + scene.collider[scene.count :]
-        numbers, pairs = pairs_between(problem, contacts, contacts.near(x), x, self.begin)
         near = contacts.near(x)
+        numbers, pairs = pairs_between(problem, contacts, near, x, self.begin)
         push = forces(contacts.pairs, near.weights, contacts.normals(near), contacts.held, len(x))
         gradient = np.where(problem.free[:, None], problem.gradient(u) - _array(push[: scene.count]), 0.0)
         moved = correct(problem, u, pushes_of(problem, u, gradient), pairs, push_pairs=False, passes=PASSES)
@@ -312,9 +312,10 @@ class _Run:
             target = self._by_hand(self._place(problem.project(self._displacement(target), self._displacement(places))))
         if swept:
             self._search(target)
-        self.contacts = self.contacts.refreshed(places, places, self.contacts.near(places))
+        near = self.contacts.near(places)
+        self.contacts = self.contacts.refreshed(places, places, near)
         if pushes.any():
-            self.contacts = self.contacts.refreshed(places, target, self.contacts.near(places))
+            self.contacts = self.contacts.refreshed(places, target, near)
             self._move(target)
         self.previous = before + self.current - x
         return cut

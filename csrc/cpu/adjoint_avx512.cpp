@@ -1,5 +1,5 @@
 #include "cpu/target/avx512.h"
 #ifdef PD_TARGET
-#include "cpu/adjoint/contact_kernels.h"
+#include "cpu/adjoint/kernels.h"
 #pragma GCC pop_options
 #endif

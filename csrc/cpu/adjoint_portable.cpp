@@ -1,0 +1,3 @@
+#include "cpu/target/portable.h"
+
+#include "cpu/adjoint/kernels.h"

@@ -1,3 +1,0 @@
-#include "cpu/target/portable.h"
-
-#include "cpu/adjoint/contact_kernels.h"

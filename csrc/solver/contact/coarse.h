@@ -1,0 +1,503 @@
+// The coarse correction of bodies in contact: rigid motions that the listed pairs join, as far as other bodies let them.
+//
+// An island, the bodies that pairs join, goes by one common share of its motions, else it would lose momentum. A share
+// turns each body about its axis by less, so no distance within a body changes: pairs of a body with itself bound
+// nothing. Pairs of different bodies bound the share. One direction each keeps their sides apart at both ends, and so on
+// the straight way. Pairs that are not listed are safe while vertices stay in their balls. A longer way finds the pairs
+// of its swept boxes itself, joins the islands that may meet there, and a search must follow.
+#pragma once
+#include "solver/coarse/island.h"
+#include "solver/contact/approach.h"
+#include "solver/contact/schedule.h"
+
+namespace pd::inline PD_TARGET {
+
+// Of the chord of a turn up to a right angle: how far a share of it leaves the straight way.
+constexpr double turn_bow = 0.25;
+constexpr int coarse_halvings = 6;  // of the interval of a share
+
+template <class T>
+class ContactCorrection {
+ public:
+  using Env = ContactEnvironment<T>;
+
+  PD_HD ContactCorrection(const Env& env, const ContactSearch<T>& search)
+      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(search) {}
+
+  // Islands of the components that listed pairs join. `numbers.corrects`: whether there is one.
+  template <class Team>
+  PD_HD void begin(const Team& team) const {
+    ContactNumbers& numbers = env_.numbers();
+    const int pairs = numbers.pairs, count = body_.components;
+    team.spread(1, [&](int) { numbers.corrects = numbers.searching = 0; });
+    team.spread(std::int64_t(count) * count, [&](int n) { a_.couple[n] = 0; });
+    team.each(count, [&](int g) {
+      a_.root[g] = g, a_.side_start[g] = 0;
+      a_.component_begin[g] = plan_.body_vertices, a_.component_end[g] = 0;
+    });
+    team.spread(pairs, [&](int p) {
+      a_.joins[p] = joins(a_.pair[p]);
+      if (!a_.joins[p]) return;
+      numbers.corrects = 1;
+      const int a = component_of(p, 0), b = component_of(p, 1);
+      if (a >= 0) count_one(a_.side_start + a);
+      if (b >= 0) count_one(a_.side_start + b);
+      if (a < 0 || b < 0) return;
+      a_.couple[std::int64_t(a) * count + b] = a_.couple[std::int64_t(b) * count + a] = 1;
+      join(a_.root, a, b);
+    });
+    team.each(plan_.body_vertices, [&](int v) {
+      const int g = a_.component[v];
+      if (g < 0) return;
+      lower(a_.component_begin + g, v);
+      raise(a_.component_end + g, v + 1);
+    });
+    if (!numbers.corrects) return;
+    team.scan(a_.side_start, count);
+    team.groups(count, [&](int g, const auto& group) {
+      if (a_.side_start[g] == a_.side_start[g + 1]) return;
+      group.select(
+          pairs,
+          [&](int p) {
+            return a_.joins[p] && (component_of(p, 0) == g || component_of(p, 1) == g);
+          },
+          a_.side_pair + a_.side_start[g]);
+      sum_body(g, group);
+    });
+    team.once([&] { lay_out(); });
+    team.each(pairs, [&](int p) {
+      if (a_.joins[p]) a_.radius[p] = pair_at(p).first_radius();
+    });
+  }
+
+  // The displacement targets, shifted by the forces of pairs: the gradient of E with those targets is the sum of elements,
+  // inertia and pairs, which planes and spheres answer.
+  template <class Team>
+  PD_HD void shift_targets(const Team& team) const {
+    const int pairs = env_.numbers().pairs;
+    team.each(pairs, [&](int p) { env_.keep_pushes(p, true), a_.active[p] = 1; });
+    team.each(body_.vertices, [&](int i) {
+      const Vec3<T> target = BodyState<T>::read(body_.target, i);
+      BodyState<T>::write(body_.saved, i, target);
+      const T inertia = body_.inertia_of(i);
+      if (!(body_.inverse_of(i) > T(0))) return;
+      BodyState<T>::write(body_.target, i,
+                          multiply_add(T(1) / inertia, env_.force_on(body_.order[i]), target));
+    });
+  }
+  template <class Team>
+  PD_HD void restore_targets(const Team& team) const {
+    team.each(body_.vertices, [&](int i) {
+      BodyState<T>::write(body_.target, i, BodyState<T>::read(body_.saved, i));
+    });
+  }
+
+  // Moves all islands, with the forces of their pairs. Targets are where planes and spheres push from there.
+  // `forces(i)`: those of planes and spheres on a vertex. `numbers.leaves`: a search must follow; `numbers.cuts`: a motion
+  // was cut; `numbers.pushes`: targets are not the places.
+  template <class Team, class Forces>
+  PD_HD void move(const Team& team, const Forces& forces) const {
+    ContactNumbers& numbers = env_.numbers();
+    find_motions(team, forces);
+    find_shares(team);
+    const int pairs = numbers.pairs;
+    team.each(pairs, [&](int p) {
+      if (!a_.joins[p]) return;
+      const int root = root_of_pair(p);
+      if (!is_valid(root)) return;
+      const auto motion = [&](int g) -> const RigidMotion<double>& { return a_.motion[g]; };
+      const CoarsePair pair = pair_at(p);
+      const Vec3<double> force = a_.coarse_share[root] < 1
+                                     ? pair.force_after(motion)
+                                     : pair.force_changed_by(motion, a_.radius[p]);
+      const double normal = dot(force, pair.normal);
+      a_.pair[p].force = {T(normal > 0 ? normal : 0.0), narrow(tangential(force, pair.normal))};
+    });
+    team.each(plan_.vertices, [&](int v) {
+      if (v >= plan_.body_vertices) {
+        a_.target[v] = a_.goal[v];
+        return;
+      }
+      const int i = a_.inside[v], g = a_.component[v];
+      const Vec3<T> u = BodyState<T>::read(body_.u, i);
+      a_.checked[v] = u;
+      a_.shift[v] = BodyState<T>::read(body_.before, i);
+      Vec3<T> push = {T(0), T(0), T(0)};
+      if (moves(v)) {
+        const double share = a_.coarse_share[a_.root[g]];
+        if (env_.walls.exist()) push = T(share) * wall_push(i, g, forces(i));
+        if (share > 0) {
+          a_.place[v] = place_after(v, a_.motion[g]);
+          BodyState<T>::write(body_.u, i, a_.place[v] - BodyState<T>::read(body_.x, i));
+        }
+        if (dot(push, push) > T(0)) numbers.pushes = 1;
+      }
+      a_.target[v] = env_.held(v) ? a_.goal[v] : a_.place[v] + push;
+    });
+  }
+
+  // The last iterate, shifted as this one.
+  template <class Team>
+  PD_HD void end(const Team& team) const {
+    team.each(body_.vertices, [&](int i) {
+      const int v = body_.order[i];
+      BodyState<T>::write(body_.before, i,
+                          a_.shift[v] + (BodyState<T>::read(body_.u, i) - a_.checked[v]));
+    });
+  }
+
+ private:
+  PD_HD static Vec3<double> wide(const Vec3<T>& a) { return widened<double>(a); }
+  PD_HD static Vec3<T> narrow(const Vec3<double>& a) { return {T(a.x), T(a.y), T(a.z)}; }
+
+  PD_HD int component_at(int v) const { return v < plan_.body_vertices ? a_.component[v] : -1; }
+  PD_HD int component_of(int p, int side) const {
+    return component_at(a_.pair[p].vertex[side == 0 ? 0 : 3]);
+  }
+  PD_HD int root_of_pair(int p) const {
+    const int a = component_of(p, 0);
+    return a_.root[a >= 0 ? a : component_of(p, 1)];
+  }
+  // a pair of different components that can yield
+  PD_HD bool joins(const ContactPair<T>& pair) const {
+    return component_at(pair.vertex[0]) != component_at(pair.vertex[3]) &&
+           pair.can_yield(a_.inverse);
+  }
+  PD_HD bool is_valid(int root) const { return a_.valid[root] != 0; }
+  // with an island, if pins do not hold it
+  PD_HD bool moves(int v) const {
+    const int g = component_at(v);
+    return g >= 0 && is_valid(a_.root[g]) && !env_.held(v);
+  }
+
+  PD_HD CoarseVertex<double> coarse_vertex(int i) const {
+    return {wide(BodyState<T>::read(body_.x, i)), wide(BodyState<T>::read(body_.u, i)),
+            double(body_.inverse_of(i))};
+  }
+  PD_HD Vec3<double> position(int i) const {
+    const CoarseVertex<double> v = coarse_vertex(i);
+    return v.x + v.u;
+  }
+
+  // The quadratics of a component.
+  template <class Group>
+  PD_HD void sum_body(int g, const Group& group) const {
+    using S = RigidSums;
+    const auto add_up = [&](auto& sums, const auto& add) {
+      group.sum_range(
+          a_.component_begin[g], a_.component_end[g],
+          [&](int v, auto& sum) {
+            if (a_.component[v] != g) return;
+            const int i = a_.inside[v];
+            add(i, double(body_.inertia_of(i)), sum);
+          },
+          sums);
+    };
+    double mean[S::target_offset] = {}, moments[S::pins - S::target_offset] = {},
+           pins[S::count - S::pins] = {}, sums[S::count];
+    add_up(mean, [&](int i, double a, auto& sum) { add_mean(sum, a, position(i)); });
+    const Vec3<double> center = center_of(mean);
+    add_up(moments, [&](int i, double a, auto& sum) {
+      const Vec3<T> offset = BodyState<T>::read(body_.target, i) - BodyState<T>::read(body_.u, i);
+      add_moments(sum, a, position(i) - center, wide(offset));
+    });
+    add_up(pins, [&](int i, double a, auto& sum) { add_pin(sum, a, position(i)); });
+    if (!group.leads()) return;
+    for (int n = 0; n < S::count; ++n)
+      sums[n] = n < S::target_offset ? mean[n]
+                : n < S::pins        ? moments[n - S::target_offset]
+                                     : pins[n - S::pins];
+    a_.coarse_body[g] = CoarseBody(RigidBody(sums));
+  }
+
+  // Members of islands, one after another.
+  PD_HD void lay_out() const {
+    const int count = body_.components;
+    ContactNumbers& numbers = env_.numbers();
+    for (int g = 0; g < count; ++g) {
+      a_.root[g] = root_of(a_.root, g);
+      a_.size[g] = a_.valid[g] = 0;
+      a_.local[g] = a_.side_start[g] < a_.side_start[g + 1] ? a_.size[a_.root[g]]++ : -1;
+    }
+    int first = 0;
+    for (int g = 0; g < count; first += a_.size[g++]) a_.first[g] = first;
+    double* matrix = a_.matrix;
+    for (int g = 0; g < count; ++g) {
+      if (a_.local[g] >= 0) a_.member[a_.first[a_.root[g]] + a_.local[g]] = g;
+    }
+    for (int g = 0; g < count; ++g) {
+      const int own = a_.size[g];
+      if (own == 0) continue;
+      a_.island[g] = CoarseIsland(a_.coarse_body, a_.member + a_.first[g], own, matrix,
+                                  a_.newton + 18 * a_.first[g]);
+      matrix += 36 * std::int64_t(own) * own;
+      if (!a_.island[g].is_done()) numbers.searching = 1;
+    }
+  }
+
+  PD_HD CoarsePair pair_at(int p) const {
+    const ContactPair<T>& of = a_.pair[p];
+    CoarsePair pair;
+    for (int s = 0; s < 2; ++s) {
+      const int g = component_of(p, s);
+      pair.side[s] = {g, {0, 0, 0}};
+      if (g < 0) continue;
+      const Vec3<double>& center = a_.coarse_body[g].motion().center;
+      for (int c = 0; c < 4; ++c) {
+        if (of.on_a(c) != (s == 0)) continue;
+        const double share = s == 0 ? double(of.near.weight[c]) : -double(of.near.weight[c]);
+        pair.side[s].arm = multiply_add(share, position(a_.inside[of.vertex[c]]) - center,
+                                        pair.side[s].arm);
+      }
+    }
+    pair.normal = wide(of.normal);
+    pair.slip = wide(of.template slip<const Vec3<T>*>(a_.place, a_.begin, of.near));
+    pair.force = multiply_add(double(of.force.normal), pair.normal,
+                              tangential(wide(of.force.tangential), pair.normal));
+    pair.gap = double(of.near.distance) - double(of.thickness);
+    pair.yielding = double(of.yielding(a_.inverse));
+    pair.friction = double(of.friction);
+    return pair;
+  }
+
+  // The motions of all islands with the least energy.
+  template <class Team, class Forces>
+  PD_HD void find_motions(const Team& team, const Forces& forces) const {
+    ContactNumbers& numbers = env_.numbers();
+    const int pairs = numbers.pairs, count = body_.components;
+    bool searching = numbers.searching != 0;
+    while (searching) {
+      team.each(pairs, [&](int p) {
+        if (!a_.joins[p]) return;
+        const CoarseIsland& island = a_.island[root_of_pair(p)];
+        if (!island.is_done())
+          a_.terms[p] = terms_of(pair_at(p), a_.coarse_body, island.renews(), a_.radius[p]);
+      });
+      team.groups(count, [&](int g, const auto& group) {
+        if (searches(g)) sum_forces(g, group, forces);
+      });
+      // all threads have read it before the passes above
+      team.spread(1, [&](int) { numbers.searching = 0; });
+      team.groups(count * count, [&](int n, const auto& group) {
+        const int row = n / count, column = n % count;
+        if (column < row && a_.root[row] == a_.root[column] && searches(row) && searches(column))
+          sum_couple(row, column, group);
+      });
+      team.groups(count, [&](int g, const auto& group) {
+        if (a_.size[g] == 0 || a_.island[g].is_done() || !group.leads()) return;
+        a_.island[g].pass(a_.coarse_sum);
+        if (!a_.island[g].is_done()) numbers.searching = 1;
+      });
+      searching = numbers.searching != 0;
+    }
+    team.each(count, [&](int g) {
+      if (a_.size[g] > 0) a_.valid[g] = a_.island[g].is_valid();
+    });
+  }
+
+  // a component of an island that is not done
+  PD_HD bool searches(int g) const { return a_.local[g] >= 0 && !a_.island[a_.root[g]].is_done(); }
+
+  // What planes, spheres and pairs add to a component.
+  template <class Group, class Forces>
+  PD_HD void sum_forces(int g, const Group& group, const Forces& forces) const {
+    double walls[ContactSums::count] = {}, sums[ContactSums::count] = {};
+    if (env_.walls.exist()) {
+      const CoarseTrial<double> trial = a_.island[a_.root[g]].trial_of(a_.coarse_body[g]);
+      group.sum_range(
+          a_.component_begin[g], a_.component_end[g],
+          [&](int v, auto& sum) {
+            if (a_.component[v] != g) return;
+            const int i = a_.inside[v];
+            each_contact_term(env_.walls, coarse_vertex(i), trial, forces(i),
+                              [&](bool adds, const auto& terms) {
+                                if (adds) add_terms(sum, terms());
+                              });
+          },
+          walls);
+    }
+    group.sum_range(
+        a_.side_start[g], a_.side_start[g + 1],
+        [&](int n, auto& sum) {
+          const int p = a_.side_pair[n], a = component_of(p, 0), side = a == g ? 0 : 1;
+          const PairTerms& of = a_.terms[p];
+          const bool counts = side == 0 || a < 0;
+          if (of.resists()) return add_terms(sum, of.of_side(side, counts));
+          if (counts) sum[ContactSums::before] += of.before;  // no force: the other numbers are 0
+        },
+        sums);
+    if (!group.leads()) return;
+    for (int n = 0; n < ContactSums::count; ++n)
+      a_.coarse_sum[g * ContactSums::count + n] = walls[n] + sums[n];
+  }
+
+  template <class Group>
+  PD_HD void sum_couple(int row, int column, const Group& group) const {
+    double sums[CoupleSums::count] = {};
+    if (a_.couple[std::int64_t(row) * body_.components + column]) {
+      group.sum_range(
+          a_.side_start[row], a_.side_start[row + 1],
+          [&](int n, auto& sum) {
+            const int p = a_.side_pair[n], side = component_of(p, 0) == row ? 0 : 1;
+            if (component_of(p, 1 - side) == column && a_.terms[p].resists())
+              add_couple(sum, a_.terms[p], side);
+          },
+          sums);
+    }
+    if (group.leads()) a_.island[a_.root[row]].set_couple(a_.local[row], a_.local[column], sums);
+  }
+
+  // A share of the motion of a component.
+  PD_HD RigidMotion<double> part_of(int g, double share) const {
+    RigidMotion<double> motion = a_.coarse_body[g].motion();
+    if (share < 1) {
+      motion.turn = small_turn(share * turn_vector(motion));
+      motion.shift = share * motion.shift;
+    }
+    return motion;
+  }
+
+  PD_HD Vec3<T> place_after(int v, const RigidMotion<double>& motion) const {
+    const int i = a_.inside[v];
+    const Vec3<T> u = BodyState<T>::read(body_.u, i) + narrow(motion.of(position(i)));
+    return body_.place(i, u);
+  }
+
+  // The shares that other bodies leave to islands, round after round until all pairs allow them.
+  template <class Team>
+  PD_HD void find_shares(const Team& team) const {
+    ContactNumbers& numbers = env_.numbers();
+    const int count = body_.components, pairs = numbers.pairs;
+    team.spread(1, [&](int) { numbers.leaves = numbers.cuts = numbers.pushes = 0; });
+    team.each(count, [&](int g) {
+      a_.coarse_share[g] = 1, a_.coarse_group[g] = a_.root[g];
+      a_.motion[g] = part_of(g, 1);
+    });
+    team.each(plan_.vertices, [&](int v) {
+      a_.end[v] = a_.place[v];
+      if (!moves(v)) return;
+      a_.end[v] = place_after(v, a_.motion[a_.component[v]]);
+      Vec3<T> inside = a_.end[v];
+      if (move_into(a_.ball[v], inside)) numbers.leaves = 1;
+    });
+    const bool leaves = numbers.leaves != 0;
+    const auto swept = [&](int v) {
+      Box<T> box{a_.place[v], a_.place[v]};
+      box.add(a_.end[v]);
+      return box;
+    };
+    const auto reach = [&](int v) {
+      const T own = T(0.5) * plan_.thickness;
+      if (!moves(v)) return own;
+      const RigidMotion<double>& motion = a_.coarse_body[a_.component[v]].motion();
+      const Vec3<double> chord = motion.turn * (wide(a_.place[v]) - motion.center);
+      return T(turn_bow * square_root(dot(chord, chord))) + own;
+    };
+    bool meets = false;
+    if (leaves) {
+      team.each(plan_.bodies, [&](int b) { a_.itself[b] = 0; });
+      team.each(plan_.body_vertices, [&](int v) {
+        const int b = plan_.body[v];
+        if (plan_.touches_itself[b] && a_.component[v] != a_.component[plan_.body_start[b]])
+          a_.itself[b] = 1;
+      });
+      meets = search_.fit(team, swept, reach, true);
+    }
+    for (int round = 0; round < share_rounds; ++round) {
+      set_limits(team);
+      const auto bound = [&](const ContactPair<T>& pair) {
+        lower_share(pair, round + 1 == share_rounds);
+      };
+      if (meets) {
+        search_.each_boxed(team, [&](const auto& found) {
+          found.each([&](int owner, int other) {
+            ContactPair<T> pair;
+            if (search_.find_pair(owner, other, pair)) bound(pair);
+          });
+        });
+      } else if (!leaves) {
+        team.each(pairs, [&](int p) { bound(a_.pair[p]); });
+      }
+      const bool changed = numbers.changed != 0;
+      team.barrier();
+      if (!changed) break;
+    }
+    set_limits(team);
+    team.each(count, [&](int g) {
+      a_.coarse_share[g] = a_.coarse_limit[g];
+      a_.motion[g] = part_of(g, a_.coarse_limit[g]);
+      if (a_.size[g] > 0 && is_valid(g) && a_.coarse_limit[g] < 1) numbers.cuts = 1;
+    });
+  }
+
+  // One share for the islands of a group.
+  template <class Team>
+  PD_HD void set_limits(const Team& team) const {
+    const int count = body_.components;
+    team.spread(1, [&](int) { env_.numbers().changed = 0; });
+    team.each(count, [&](int g) { a_.coarse_joint[g] = 1; });
+    team.each(count, [&](int g) {
+      if (a_.local[g] >= 0)
+        lower(a_.coarse_joint + root_of(a_.coarse_group, g), a_.coarse_share[a_.root[g]]);
+    });
+    team.each(count,
+              [&](int g) { a_.coarse_limit[g] = a_.coarse_joint[root_of(a_.coarse_group, g)]; });
+  }
+
+  // Lowers the shares of both sides to what keeps a pair of different components apart; in the `last` round to 0.
+  PD_HD void lower_share(const ContactPair<T>& pair, bool last) const {
+    const int side[2] = {component_at(pair.vertex[0]), component_at(pair.vertex[3])};
+    if (side[0] == side[1]) return;
+    bool some = false;
+    for (int v : pair.vertex) some = some || moves(v);
+    if (!some) return;
+    const auto goes = [&](int g) { return g >= 0 && is_valid(a_.root[g]); };
+    double limit = 1;
+    for (int g : side)
+      if (goes(g) && a_.coarse_limit[g] < limit) limit = a_.coarse_limit[g];
+    if (goes(side[0]) && goes(side[1])) join(a_.coarse_group, a_.root[side[0]], a_.root[side[1]]);
+    Vec3<T> start[4], end[4];
+    pair.corners(a_.place, start);
+    pair.corners(a_.end, end);
+    const Kept<T> kept = direction_of(pair, start, end);
+    const auto allowed = [&](double share) {
+      if (share < 1) {
+        for (int c = 0; c < 4; ++c) {
+          const int v = pair.vertex[c];
+          if (moves(v)) end[c] = place_after(v, part_of(a_.component[v], share));
+        }
+      }
+      return kept.allows(pair.edges, end);
+    };
+    if (allowed(limit)) return;
+    double least = 0, most = 1;
+    for (int n = 0; n < coarse_halvings; ++n) {
+      const double middle = 0.5 * (least + most);
+      (middle < limit && allowed(middle) ? least : most) = middle;
+    }
+    env_.numbers().changed = 1;
+    for (int g : side)
+      if (goes(g)) lower(a_.coarse_share + a_.root[g], last ? 0.0 : least);
+  }
+
+  // What planes and spheres push after the whole motion of a component.
+  template <class Forces>
+  PD_HD Vec3<T> wall_push(int i, int g, const Forces& forces) const {
+    const auto vertex = body_.vertex(i);
+    CoarseVertex<double> v = coarse_vertex(i);
+    const Vec3<T> u = BodyState<T>::read(body_.u, i);
+    const Vec3<T> moved =
+        vertex.displaced(u, narrow(a_.coarse_body[g].motion().of(v.x + v.u)));
+    v.u = wide(moved);
+    const Vec3<T> out = vertex.displaced(moved, narrow(push_of(env_.walls, v, forces)));
+    return vertex.project(env_.walls, out, out) - moved;
+  }
+
+  const Env& env_;
+  const ContactPlan<T>& plan_;
+  const ContactArrays<T>& a_;
+  const BodyState<T>& body_;
+  const ContactSearch<T>& search_;
+};
+
+}  // namespace pd::inline PD_TARGET
