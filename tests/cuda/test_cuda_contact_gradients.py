@@ -15,6 +15,7 @@ from adjoint_scenes import (
     WITH_SCENE,
     Step,
     cube_on_cube,
+    edge_on_edge,
     seeded,
     sliding_cube,
     sticking_cube,
@@ -40,7 +41,7 @@ def pressed() -> Step:
     course = pressed_cubes()
     sim = simulator(course.scene, CONVERGED)
     state: Any = course.start(sim)
-    for number in range(5):
+    for number in range(11):
         state = sim(state, targets=course.targets(number))  # type: ignore[misc]
     return Step(sim, state)
 
@@ -105,6 +106,12 @@ class Saved:
 
     def gradients(self, sim: pd.Simulator) -> dict[str, Tensor]:
         """By the op, on the device of a simulator of the same scene."""
+        found = torch.ops.torchpd.contact_step_vjp(*self.arguments(sim), time_step=H)
+        names = [*NAMES, *(f"material {number}" for number in range(len(found) - len(NAMES)))]
+        return {name: array for name, array in zip(names, found, strict=True) if array.numel()}
+
+    def arguments(self, sim: pd.Simulator) -> list[Any]:
+        """Of the op, on that device."""
         like = sim.rest_positions
         assert sim.body_contact is not None
 
@@ -115,13 +122,10 @@ class Saved:
         seeds = [seeded(self.after[:1].cpu(), n).expand(count, -1, -1).contiguous() for n in range(2)]
         grads = [seeds[0], H * seeds[1], seeded(self.poses[:1].cpu(), 2).expand(count, -1, -1).contiguous()]
         state = [self.after, self.positions, self.velocities]
-        found = torch.ops.torchpd.contact_step_vjp(
+        return [
             *map(moved, [*grads, *state]), None, moved(self.poses), [moved(array) for array in self.history],
             moved(self.pushes), moved(self.taken_back), sim.material(), plan_of(sim), sim.body_contact.arrays,
-            time_step=H,
-        )  # fmt: skip
-        names = [*NAMES, *sim.material_names]
-        return {name: array for name, array in zip(names, found, strict=True) if array.numel()}
+        ]  # fmt: skip
 
 
 def on_gpu(step: Step, dtype: torch.dtype = torch.float64) -> pd.Simulator:
@@ -146,14 +150,14 @@ def test_the_gradients_of_the_cpu(name: str) -> None:
 
 @pytest.mark.parametrize("make", [sliding_cube, sticking_cube, pressed])
 def test_float32(make: Callable[[], Step]) -> None:
-    """As near to float64 as the CPU is, times four."""
+    """As near to float64 as the CPU is, or as a residual of 1e-5 leaves it: to 1e-4."""
     saved = Saved.of(make())
     wanted = saved.gradients(saved.step.sim)
     single = simulator(saved.step.sim.scene, CONVERGED, dtype=torch.float32)
     host, found = saved.gradients(single), saved.gradients(on_gpu(saved.step, torch.float32))
     for key in ("positions", "velocities", "forces"):
         assert found[key].dtype == torch.float32
-        assert relative(found[key], wanted[key]) <= 4.0 * relative(host[key], wanted[key]) + 1e-5, key
+        assert relative(found[key], wanted[key]) <= max(4.0 * relative(host[key], wanted[key]), 1e-4), key
 
 
 @pytest.mark.parametrize("make", [sliding_cube, sticking_cube, cube_on_cube, pressed])
@@ -173,7 +177,7 @@ def test_the_same_bits_in_a_batch(make: Callable[[], Step], dtype: torch.dtype) 
     assert not torch.equal(together["positions"][0], together["positions"][299])
 
 
-@pytest.mark.parametrize("make", [vertex_on_triangle, sliding_cube, sticking_cube])
+@pytest.mark.parametrize("make", [vertex_on_triangle, edge_on_edge, sticking_cube])
 def test_differences(make: Callable[[], Step]) -> None:
     """Of converged steps on the GPU itself, along a random direction: to 1e-6."""
     step = make()
@@ -218,20 +222,23 @@ def test_a_step_that_is_taken_back() -> None:
     assert not found["forces"][1].any()
 
 
-def test_the_host_waits_only_for_counts() -> None:
+def test_the_host_waits_only_for_counts(capfd: pytest.CaptureFixture[str]) -> None:
     """The host reads how many pairs there are, twice, and whether solves have failed: however many iterations."""
     saved = Saved.of(sliding_cube())
     sim = on_gpu(saved.step)
-    saved = saved.on(GPU)
-    saved.gradients(sim)
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            saved.gradients(sim)
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert len([each for each in caught if "synchroniz" in str(each.message)]) == 3
+    arguments = saved.arguments(sim)
+    torch.ops.torchpd.contact_step_vjp(*arguments, time_step=H)
+    capfd.readouterr()
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            torch.ops.torchpd.contact_step_vjp(*arguments, time_step=H)
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    # torch warns in Python, or on stderr from C++ alone
+    said = [*map(str, (each.message for each in caught)), capfd.readouterr().err]
+    assert sum(text.count("called a synchronizing") for text in said) == 3
 
 
 @pytest.mark.parametrize("name", OF_CONTACT)

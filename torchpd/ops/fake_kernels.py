@@ -105,7 +105,7 @@ def _(
 ) -> list[Tensor]:
     state = [positions.new_empty(positions.shape) for _ in range(3)]
     moved = [poses.new_empty(poses.shape) for _ in range(2)]
-    own = [contact[place].new_empty(contact[place].shape) for place in (CONTACT_FRICTION, CONTACT_THICKNESS)]
+    own = [positions.new_empty(contact[place].shape) for place in (CONTACT_FRICTION, CONTACT_THICKNESS)]
     asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
     return [*state, *moved, *own, *(array.new_empty(array.shape) for array, one in asked if one)]
 

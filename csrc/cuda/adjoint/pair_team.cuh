@@ -24,19 +24,24 @@ class PairTeam {
   PD_DEVICE void grid(int rows, int columns, const Item& item) const {
     each(std::int64_t(rows) * columns, [&](int n) { item(n / columns, n % columns); });
   }
-  template <class Length, class Term, class Take>
-  PD_DEVICE void dots(std::int64_t count, const Length& length, const Term& term,
-                      const Take& take) const {
-    const int lane = int(threadIdx.x) % warp_size;
-#pragma unroll 1
-    for (std::int64_t n = team_.warp(); n < count; n += team_.warps()) {
-      const int terms = length(int(n));
+  template <class Of, class Take>
+  PD_DEVICE void dots(std::int64_t count, const Of& of, const Take& take) const {
+    each_warp(count, [&](int n, int lane) {
+      const DotProduct product = of(n);
       double sum = 0;
-      for (int p = lane; p < terms; p += warp_size) sum += term(int(n), p);
+      for (int p = lane; p < product.length; p += warp_size) sum += product.a[p] * product.b[p];
       sum = warp_reduce(sum, Add());
-      if (lane == 0) take(int(n), sum);
-    }
-    team_.barrier();
+      if (lane == 0) take(n, sum);
+    });
+  }
+  template <class Term, class Take>
+  PD_DEVICE void sums(std::int64_t count, int length, const Term& term, const Take& take) const {
+    each_warp(count, [&](int n, int lane) {
+      double sum = 0;
+      for (int p = lane; p < length; p += warp_size) sum += term(n, p);
+      sum = warp_reduce(sum, Add());
+      if (lane == 0) take(n, sum);
+    });
   }
   // Every block looks at all.
   template <class Value>
@@ -89,6 +94,13 @@ class PairTeam {
   PD_DEVICE int add(int* to, int more) const { return atomicAdd(to, more); }
 
  private:
+  template <class Visit>
+  PD_DEVICE void each_warp(std::int64_t count, const Visit& visit) const {
+    const int lane = int(threadIdx.x) % warp_size;
+#pragma unroll 1
+    for (std::int64_t n = team_.warp(); n < count; n += team_.warps()) visit(int(n), lane);
+    team_.barrier();
+  }
   // the earlier one of equals
   PD_DEVICE static Largest larger(const Largest& a, const Largest& b) {
     if (b.index < 0 || a.value > b.value) return a;

@@ -1,6 +1,5 @@
 // Kernels of cuda/contact/launch.h: a team of blocks takes one environment after another.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/inputs.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/teams.cuh"
@@ -8,6 +7,7 @@
 #include "cuda/contact/team.cuh"
 #include "cuda/rigid/contact_forces.h"
 #include "solver/contact/step.h"
+#include "views/arena.h"
 
 #include <algorithm>
 

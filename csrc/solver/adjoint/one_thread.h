@@ -15,6 +15,12 @@ struct Largest {
   int index;
 };
 
+// Of two arrays.
+struct DotProduct {
+  const double *a, *b;
+  int length;
+};
+
 class OneThread {
  public:
   template <class Item>
@@ -34,18 +40,28 @@ class OneThread {
     for (int i = 0; i < rows; ++i)
       for (int j = 0; j < columns; ++j) item(i, j);
   }
-  // take(n, sum of term(n, p) over p below length(n))
-  template <class Length, class Term, class Take>
-  void dots(std::int64_t count, const Length& length, const Term& term, const Take& take) const {
+  // take(n, the product of(n))
+  template <class Of, class Take>
+  void dots(std::int64_t count, const Of& of, const Take& take) const {
     constexpr int width = 8;
     for (int n = 0; n < int(count); ++n) {
+      const DotProduct product = of(n);
+      const double *a = product.a, *b = product.b;
       double sums[width] = {}, sum = 0;
-      const int terms = length(n);
-      int p = 0;
-      for (; p + width <= terms; p += width)
-        for (int u = 0; u < width; ++u) sums[u] += term(n, p + u);
-      for (; p < terms; ++p) sum += term(n, p);
+      int left = product.length;
+      for (; left >= width; left -= width, a += width, b += width)
+        for (int u = 0; u < width; ++u) sums[u] += a[u] * b[u];
+      for (int u = 0; u < left; ++u) sum += a[u] * b[u];
       for (double part : sums) sum += part;
+      take(n, sum);
+    }
+  }
+  // take(n, sum of term(n, p) over p below length)
+  template <class Term, class Take>
+  void sums(std::int64_t count, int length, const Term& term, const Take& take) const {
+    for (int n = 0; n < int(count); ++n) {
+      double sum = 0;
+      for (int p = 0; p < length; ++p) sum += term(n, p);
       take(n, sum);
     }
   }

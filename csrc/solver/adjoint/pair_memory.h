@@ -15,8 +15,7 @@ struct PairItem {
   LoadedPair<double> pair;
   PairSlopes<double> slopes;
   double step;  // of its multipliers in a sweep
-  int first_row;
-  int bodies;  // place in the table of friction
+  int bodies;   // place in the table of friction
   bool has_scene_thickness;
 };
 
@@ -52,6 +51,7 @@ struct PairSizes {
 
 struct PairMemory {
   PairItem* item;
+  int *first, *end;  // [pairs] rows
   PairRow* row;
   int *of_item, *as_pivot;  // [rows] item, and number among the independent rows, or -1
   int* corner;              // [4 rows] nodes that move, or -1
@@ -75,6 +75,7 @@ struct PairMemory {
   template <class Arena>
   PD_HD void arrange(Arena& arena, const PairSizes& s) {
     arena.place(item, s.pairs);
+    for (int** array : {&first, &end}) arena.place(*array, s.pairs);
     arena.place(row, s.rows());
     for (int** array : {&of_item, &as_pivot}) arena.place(*array, s.rows());
     arena.place(corner, 4 * s.rows());

@@ -135,10 +135,11 @@ class PairRows {
       m_.sums[n] = sum;
     });
     team_.dots(
-        m_.counts->pivots, [&](int n) { return n - patch_of(n).first_pivot + 1; },
-        [&](int n, int j) {
+        m_.counts->pivots,
+        [&](int n) {
           const PairPatch& patch = patch_of(n);
-          return square_row(f_.inverse_lower, patch, n)[j] * m_.sums[patch.first_pivot + j];
+          return DotProduct{square_row(f_.inverse_lower, patch, n), m_.sums + patch.first_pivot,
+                            n - patch.first_pivot + 1};
         },
         [&](int n, double sum) { m_.turned[n] = sum; });
   }
@@ -146,11 +147,12 @@ class PairRows {
   // to <- L_r^-T from
   PD_HD void upper(const double* from, double* to) const {
     team_.dots(
-        m_.counts->pivots, [&](int n) { return patch_of(n).first_pivot + patch_of(n).rank - n; },
-        [&](int n, int i) {
+        m_.counts->pivots,
+        [&](int n) {
           const PairPatch& patch = patch_of(n);
           const int own = n - patch.first_pivot;
-          return square_row(f_.inverse_lower, patch, n)[own + i] * from[n + i];
+          return DotProduct{square_row(f_.inverse_lower, patch, n) + own, from + n,
+                            patch.rank - own};
         },
         [&](int n, double sum) { to[n] = sum; });
   }
@@ -158,10 +160,11 @@ class PairRows {
   // to <- L^T from, a number of every row
   PD_HD void lower_transposed(const double* from, double* to) const {
     team_.dots(
-        m_.counts->pivots, [&](int n) { return rows_of(patch_of(n)); },
-        [&](int n, int p) {
+        m_.counts->pivots,
+        [&](int n) {
           const PairPatch& patch = patch_of(n);
-          return column_of(patch, n - patch.first_pivot)[p] * from[patch.begin + p];
+          return DotProduct{column_of(patch, n - patch.first_pivot), from + patch.begin,
+                            rows_of(patch)};
         },
         [&](int n, double sum) { to[n] = sum; });
   }
@@ -169,10 +172,10 @@ class PairRows {
   // to <- the square matrix of every patch times from
   PD_HD void squares(double* of, const double* from, double* to) const {
     team_.dots(
-        m_.counts->pivots, [&](int n) { return patch_of(n).rank; },
-        [&](int n, int j) {
+        m_.counts->pivots,
+        [&](int n) {
           const PairPatch& patch = patch_of(n);
-          return square_row(of, patch, n)[j] * from[patch.first_pivot + j];
+          return DotProduct{square_row(of, patch, n), from + patch.first_pivot, patch.rank};
         },
         [&](int n, double sum) { to[n] = sum; });
   }
@@ -194,13 +197,12 @@ class PairRows {
   template <class Add, class Factor>
   PD_HD void add_held(const Add& add, const Factor& factor) const {
     team_.each(vertices_, [&](int v) {
+      if (!(m_.inverse[v] > 0)) return;
       Place sum = {0, 0, 0};
       bool some = false;
       for (int n = m_.start[v]; n < m_.start[v + 1]; ++n) {
-        const PairItem& item = m_.item[m_.entry[n] / 4];
-        const int a = m_.entry[n] % 4;
-        if (item.moves[a] < 0) continue;
-        for (int p = item.first_row; p < item.first_row + item.pair.rows(); ++p) {
+        const int item = m_.entry[n] / 4, a = m_.entry[n] % 4;
+        for (int p = m_.first[item]; p < m_.end[item]; ++p) {
           if (m_.as_pivot[p] < 0) continue;
           sum = sum + m_.sums[m_.as_pivot[p]] * m_.row[p].held[a];
           some = true;
@@ -300,9 +302,9 @@ class PairRows {
       team_.each(vertices_, [&](int v) {
         Place sum = {0, 0, 0};
         for (int n = m_.start[v]; n < m_.start[v + 1]; ++n) {
-          const PairItem& item = m_.item[m_.entry[n] / 4];
-          if (item.first_row < patch.begin || item.first_row >= patch.end) break;
-          for (int p = item.first_row; p < item.first_row + item.pair.rows(); ++p)
+          const int item = m_.entry[n] / 4;
+          if (m_.first[item] < patch.begin || m_.first[item] >= patch.end) break;
+          for (int p = m_.first[item]; p < m_.end[item]; ++p)
             sum = sum + column[p - patch.begin] * m_.row[p].pushed[m_.entry[n] % 4];
         }
         m_.field[v] = sum;
@@ -324,10 +326,11 @@ class PairRows {
       const int rank = patch.rank;
       double* const to = f_.mixed + patch.square;
       team_.dots(
-          std::int64_t(rank) * (rank + 1) / 2, [&](int) { return rows_of(patch); },
-          [&](int at, int p) {
+          std::int64_t(rank) * (rank + 1) / 2,
+          [&](int at) {
             const Corner of(at);
-            return column_of(patch, of.row)[p] * column_of(patch, of.column)[p];
+            return DotProduct{column_of(patch, of.row), column_of(patch, of.column),
+                              rows_of(patch)};
           },
           [&](int at, double sum) {
             const Corner of(at);

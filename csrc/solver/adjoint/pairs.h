@@ -108,8 +108,8 @@ class AdjointPairs {
           start[i] += slope.load[c] * l[c];
         }
         for (int k = 0; k < item.pair.rows(); ++k) {
-          end[i] += item.slopes.row[k][j] * nu[item.first_row + k];
-          start[i] += slope.row[k] * nu[item.first_row + k];
+          end[i] += item.slopes.row[k][j] * nu[m_.first[n / 4] + k];
+          start[i] += slope.row[k] * nu[m_.first[n / 4] + k];
         }
       }
       m_.part[n] = {end[0], end[1], end[2]};
@@ -118,11 +118,11 @@ class AdjointPairs {
     to_places(m_.part, call_.poses_after, out.end, out.poses_end);
     to_places(m_.part_of_start, call_.poses_before, out.start, out.poses_start);
     to_friction(read, out.friction + environment_ * plan_.bodies * plan_.bodies);
-    team_.dots(
-        1, [&](int) { return pairs; },
+    team_.sums(
+        1, pairs,
         [&](int, int n) {
           const PairItem& item = m_.item[n];
-          return item.has_scene_thickness ? nu[item.first_row] : 0.0;
+          return item.has_scene_thickness ? nu[m_.first[n]] : 0.0;
         },
         [&](int, double sum) { out.thickness[environment_] = T(sum); });
   }
@@ -328,8 +328,8 @@ class AdjointPairs {
         low += own * rank;
         square += rank * rank;
       }
-      m_.item[n].first_row = m_.size[m_.label[n]];
-      m_.size[m_.label[n]] += m_.item[n].pair.rows();
+      m_.first[n] = m_.size[m_.label[n]];
+      m_.end[n] = m_.size[m_.label[n]] += m_.item[n].pair.rows();
     }
     m_.counts->rows = rows;
     m_.counts->patches = patches;
@@ -347,7 +347,7 @@ class AdjointPairs {
   PD_HD void write_row(int number, int k, const Projector& projector, const Sliding& sliding) {
     const PairItem& item = m_.item[number];
     const double scale = sqrt(item.step);
-    const int p = item.first_row + k;
+    const int p = m_.first[number] + k;
     PairRow& row = m_.row[p];
     bool skewed = item.pair.state != PairState::smooth;
     m_.of_item[p] = number;
@@ -386,8 +386,8 @@ class AdjointPairs {
       T* const own = bodies + 3 * (environment_ * count_ + order_[node]);
       own[0] = T(sum.x), own[1] = T(sum.y), own[2] = T(sum.z);
     });
-    team_.dots(
-        7 * std::int64_t(plan_.colliders), [&](int) { return plan_.vertices - count_; },
+    team_.sums(
+        7 * std::int64_t(plan_.colliders), plan_.vertices - count_,
         [&](int n, int v) { return by_pose(n, count_ + v, poses); },
         [&](int n, double sum) { to[7 * environment_ * plan_.colliders + n] = T(-sum); });
   }
