@@ -29,7 +29,7 @@ from contact_scenes import (
     watched,
 )
 
-from torchpd.reference.contact import crossings, hands, limit, linking_number, lists, step
+from torchpd.reference.contact import hands, limit, linking_number, lists, step
 from torchpd.reference.contact.distance import closest
 from torchpd.reference.contact.planes import Planes, make_planes
 from torchpd.reference.contact.search import near_pairs
