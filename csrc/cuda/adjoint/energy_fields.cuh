@@ -1,6 +1,5 @@
 // Elastic energy and its derivatives at given positions, in one pass over the patches of any plan.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/reductions.h"
 #include "cuda/common/runtime.h"
@@ -8,6 +7,7 @@
 #include "cuda/elements/pair_weights.h"
 #include "cuda/elements/pairs_per_thread.h"
 #include "elements/solid_fields.h"
+#include "views/arena.h"
 #include "views/shared_memory.h"
 
 #include <stdexcept>

@@ -1,7 +1,7 @@
 // The numbers of a step of all stencils, computed once a call from the rows of the material.
 #pragma once
-#include "views/arena.h"
 #include "cuda/elements/stencils.h"
+#include "views/arena.h"
 
 #include <cuda_runtime.h>
 

@@ -1,10 +1,10 @@
 // Launches of block teams, each with one environment at a time, and the team's preconditioner
 // memory.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/runtime.h"
 #include "cuda/multilevel/v_cycle.h"
+#include "views/arena.h"
 
 #include <algorithm>
 

@@ -1,6 +1,5 @@
 // Kernels of cuda/contact/launch.h: a team of blocks takes one environment after another.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/inputs.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/teams.cuh"
@@ -8,6 +7,7 @@
 #include "cuda/contact/team.cuh"
 #include "cuda/rigid/contact_forces.h"
 #include "solver/contact/step.h"
+#include "views/arena.h"
 
 #include <algorithm>
 
@@ -44,9 +44,7 @@ int count_chunks(const ContactWork<T>& work) {
 
 template <class T>
 std::int64_t arrange(const ContactWork<T>& work, void* base, ContactMemory<T>& m) {
-  const auto each = [&](Arena& arena) {
-    arrange(arena, work.contact.plan, work.pieces, m.first);
-  };
+  const auto each = [&](Arena& arena) { arrange(arena, work.contact.plan, work.pieces, m.first); };
   Arena size(nullptr);
   each(size);
   m.stride = size.size();

@@ -1,9 +1,9 @@
 // Launch of the fused kernel in one precision.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/runtime.h"
 #include "cuda/fused/kernels.cuh"
+#include "views/arena.h"
 
 #include <algorithm>
 #include <cmath>

@@ -1,9 +1,9 @@
 // The coarse correction of a vertex (solver/coarse), and the contact forces that it keeps in device memory.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/vertices.h"
 #include "solver/coarse/newton.h"
+#include "views/arena.h"
 
 namespace pd::inline PD_TARGET {
 

@@ -1,10 +1,10 @@
 // The small-batch kernel and its launch.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/runtime.h"
 #include "cuda/small_batch/block_shape.h"
 #include "cuda/small_batch/rigid.h"
+#include "views/arena.h"
 
 #include <algorithm>
 

@@ -1,7 +1,6 @@
 // Runs solver/step.h on the host: every part of a step is a launch. It supports every mesh, effect
 // and batch.
 #pragma once
-#include "views/arena.h"
 #include "cuda/common/launch.h"
 #include "cuda/common/runtime.h"
 #include "cuda/common/teams.cuh"
@@ -16,6 +15,7 @@
 #include "cuda/stream/shared_vertices.h"
 #include "solver/multilevel/lbfgs.h"
 #include "solver/step.h"
+#include "views/arena.h"
 #include "views/shared_memory.h"
 
 #include <algorithm>
