@@ -31,8 +31,8 @@ class ContactApproach {
  public:
   using Env = ContactEnvironment<T>;
 
-  PD_HD ContactApproach(const Env& env, const ContactSearch<T>& search)
-      : env_(env), plan_(env.plan), a_(env.a), search_(search) {}
+  PD_HD explicit ContactApproach(const Env& env)
+      : env_(env), plan_(env.plan), a_(env.a), search_(env) {}
 
   // Moves the places toward the targets.
   template <class Team>
@@ -366,7 +366,7 @@ class ContactApproach {
   const Env& env_;
   const ContactPlan<T>& plan_;
   const ContactArrays<T>& a_;
-  const ContactSearch<T>& search_;
+  const ContactSearch<T> search_;
 };
 
 }  // namespace pd::inline PD_TARGET
