@@ -163,7 +163,14 @@ class ContactApproach {
         [&](int v) { return a_.weight[v] + T(0.5) * plan_.thickness; }, false);
     if (asks)
       search_.each_boxed(team, [&](const auto& found) {
-        found.each([&](int owner, int other) { unfold(owner, other); });
+        found.each_closest([&](int owner, int other) { return search_.sides_of(owner, other); },
+                           a_.place,
+                           [&](int owner, int other, const Closest<T>& near) {
+                             ContactPair<T> pair = search_.sides_of(owner, other);
+                             pair.near = near;
+                             const auto reach = [&](int v) { return a_.weight[v]; };
+                             if (pair.is_within(reach, plan_.thickness)) unfold(owner, other);
+                           });
       });
     // between bodies alone from now on
     team.each(plan_.bodies, [&](int b) { a_.itself[b] = 0; });
