@@ -58,7 +58,7 @@ def on_gpu(course: Course, iterations: int, dtype: torch.dtype = torch.float64, 
     return simulator(course.scene, iterations, dtype=dtype, device=GPU, **options)
 
 
-# No two distances are equal, else rounding decides between pairs: with flat faces and with symmetry a change of places by
+# No two distances are equal, else rounding decides between pairs. With flat faces or symmetry a change of places by
 # 2e-16 changes a step on the CPU alone by 1e-6 to 1e-2 of its way.
 _WITHOUT_TIES: dict[str, tuple[Callable[[], Course], tuple[int, ...]]] = {
     "pressed cubes": (pressed_cubes, (4, 16, 64)),

@@ -31,8 +31,8 @@ class ContactApproach {
  public:
   using Env = ContactEnvironment<T>;
 
-  PD_HD ContactApproach(const Env& env, const ContactSearch<T>& search)
-      : env_(env), plan_(env.plan), a_(env.a), search_(search) {}
+  PD_HD explicit ContactApproach(const Env& env)
+      : env_(env), plan_(env.plan), a_(env.a), search_(env) {}
 
   // Moves the places toward the targets.
   template <class Team>
@@ -163,7 +163,14 @@ class ContactApproach {
         [&](int v) { return a_.weight[v] + T(0.5) * plan_.thickness; }, false);
     if (asks)
       search_.each_boxed(team, [&](const auto& found) {
-        found.each([&](int owner, int other) { unfold(owner, other); });
+        found.each_closest([&](int owner, int other) { return search_.sides_of(owner, other); },
+                           a_.place,
+                           [&](int owner, int other, const Closest<T>& near) {
+                             ContactPair<T> pair = search_.sides_of(owner, other);
+                             pair.near = near;
+                             const auto reach = [&](int v) { return a_.weight[v]; };
+                             if (pair.is_within(reach, plan_.thickness)) unfold(owner, other);
+                           });
       });
     // between bodies alone from now on
     team.each(plan_.bodies, [&](int b) { a_.itself[b] = 0; });
@@ -366,7 +373,7 @@ class ContactApproach {
   const Env& env_;
   const ContactPlan<T>& plan_;
   const ContactArrays<T>& a_;
-  const ContactSearch<T>& search_;
+  const ContactSearch<T> search_;
 };
 
 }  // namespace pd::inline PD_TARGET

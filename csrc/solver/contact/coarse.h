@@ -21,8 +21,8 @@ class ContactCorrection {
  public:
   using Env = ContactEnvironment<T>;
 
-  PD_HD ContactCorrection(const Env& env, const ContactSearch<T>& search)
-      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(search) {}
+  PD_HD explicit ContactCorrection(const Env& env)
+      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env) {}
 
   // Islands of the components that listed pairs join. `numbers.corrects`: whether there is one.
   template <class Team>
@@ -496,7 +496,7 @@ class ContactCorrection {
   const ContactPlan<T>& plan_;
   const ContactArrays<T>& a_;
   const BodyState<T>& body_;
-  const ContactSearch<T>& search_;
+  const ContactSearch<T> search_;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -122,7 +122,19 @@ class ContactSearch {
   // other side, it takes that: no pair more is listed. Forces are those of the list before, or of
   // the history in a `first` search.
   template <class Team>
-  PD_CALLED void find(const Team& team, bool first) const {
+  PD_HD void find(const Team& team, bool first) const {
+    find_by(env_, team, first);
+  }
+
+ private:
+  // Arguments by value: what has its address taken is kept in memory by all callers.
+  template <class Team>
+  PD_CALLED static void find_by(Env env, Team team, bool first) {
+    ContactSearch(env).list_pairs(team, first);
+  }
+
+  template <class Team>
+  PD_HD void list_pairs(const Team& team, bool first) const {
     const ContactPlan<T>& plan = env_.plan;
     const ContactArrays<T>& a = env_.a;
     ContactNumbers& numbers = env_.numbers();
@@ -205,7 +217,6 @@ class ContactSearch {
     index(team, count);
   }
 
- private:
   PD_HD static ClusterBoxes<T> boxes(const Env& env) {
     const ContactPlan<T>& plan = env.plan;
     const ContactArrays<T>& a = env.a;

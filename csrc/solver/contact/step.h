@@ -19,7 +19,7 @@ class ContactSteps {
         a_(env.a),
         body_(env.body),
         search_(env),
-        correction_(env, search_),
+        correction_(env),
         prox_(env) {}
 
   // A step begins at the places of bodies; poses are those of colliders, actual ones and those of the step's end.
@@ -70,7 +70,7 @@ class ContactSteps {
   // Approach, search and the first iterate, as near to the corrected guess as the promise allows.
   template <class Team>
   PD_HD void go_first(const Team& team) const {
-    const ContactApproach<T> approach(env_, search_);
+    const ContactApproach<T> approach(env_);
     const int known = env_.numbers().known;
     restore_touching(team, [&](const auto& touch) {
       team.each(known, [&](int n) {
