@@ -42,7 +42,10 @@ def pressed() -> Step:
     sim = simulator(course.scene, CONVERGED)
     state: Any = course.start(sim)
     for number in range(11):
-        state = sim(state, targets=course.targets(number))  # type: ignore[misc]
+        targets = course.targets(number)  # type: ignore[misc]
+        state = sim(state, targets=targets)
+    (held,) = targets.values()
+    sim.pin_targets[..., -len(held) :, :] = held  # for the next step, too
     return Step(sim, state)
 
 
@@ -129,7 +132,9 @@ class Saved:
 
 
 def on_gpu(step: Step, dtype: torch.dtype = torch.float64) -> pd.Simulator:
-    return simulator(step.sim.scene, CONVERGED, dtype=dtype, device=GPU)
+    sim = simulator(step.sim.scene, CONVERGED, dtype=dtype, device=GPU)
+    sim.pin_targets.copy_(step.sim.pin_targets)
+    return sim
 
 
 @pytest.mark.parametrize("name", STEPS)
@@ -154,6 +159,7 @@ def test_float32(make: Callable[[], Step]) -> None:
     saved = Saved.of(make())
     wanted = saved.gradients(saved.step.sim)
     single = simulator(saved.step.sim.scene, CONVERGED, dtype=torch.float32)
+    single.pin_targets.copy_(saved.step.sim.pin_targets)
     host, found = saved.gradients(single), saved.gradients(on_gpu(saved.step, torch.float32))
     for key in ("positions", "velocities", "forces"):
         assert found[key].dtype == torch.float32
