@@ -8,6 +8,9 @@ BIN := $(VENV)/bin
 # Files of csrc and its folders, so that a removed file counts as a change too.
 NATIVE_SOURCES := $(shell find csrc -name '.*' -prune -o -print 2>/dev/null)
 CXX_FILES = $(shell find csrc -type f \( -name '*.cpp' -o -name '*.h' -o -name '*.cu' -o -name '*.cuh' -o -name '*.inl' \))
+# Kernels are compiled for the instruction sets of this processor; all is for packages that go to other machines.
+TORCHPD_BUILD ?= native
+export TORCHPD_BUILD
 PYTHONS := python3 python3.14 python3.13 python3.12 python3.11 python3.10
 # Modules are compiled once, at their first import, whatever the environment says: torch takes twice as long without.
 export PYTHONDONTWRITEBYTECODE :=

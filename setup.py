@@ -94,6 +94,26 @@ def relative(pattern: str) -> list[str]:
     return sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "csrc").glob(pattern))
 
 
+# What the kernels of the CPU are compiled for, and the flags of /proc/cpuinfo that it takes.
+INSTRUCTION_SETS = {
+    "avx512": {"avx512f", "avx512vl", "avx512bw", "avx512dq"},
+    "avx2": {"avx2", "fma"},
+    "portable": set(),
+}
+
+
+def left_out() -> set[str]:
+    """Instruction sets that are not compiled: with TORCHPD_BUILD=native those that this processor does not run."""
+    wanted = os.environ.get("TORCHPD_BUILD", "all")
+    if wanted not in ("all", "native"):
+        fail(f"TORCHPD_BUILD must be all or native, got {wanted!r}; unset it to compile every instruction set.")
+    try:
+        flags = set(re.findall(r"^flags\s*:(.*)$", Path("/proc/cpuinfo").read_text(), re.M)[0].split())
+    except (OSError, IndexError):  # another system or processor: the sources leave out what it lacks
+        return set()
+    return {name for name, needed in INSTRUCTION_SETS.items() if wanted == "native" and not needed <= flags}
+
+
 def longest_first(paths: list[str]) -> list[str]:
     """The order of the build, so that the units that take minutes leave no core without work at its end."""
     return sorted(paths, key=lambda path: "/cpu/isa_" not in path)
@@ -109,13 +129,16 @@ def make_extension():
     # Apple's clang has no -fopenmp: the code runs on one thread there.
     threads = ["-fopenmp"] if compiles(["-std=c++20", "-fopenmp"]) else []
     cxx = ["-std=c++20", *OPTIMISATION, *X86, *threads, *WARNINGS, *system]
+    without = left_out()
+    units = [path for path in relative("**/*.cpp") if Path(path).stem.rpartition("_")[2] not in without]
     return kind(
         name="torchpd._C",
-        sources=longest_first([path for path in relative("**/*.cpp") if cuda or "/cuda/" not in path])
+        sources=longest_first([path for path in units if cuda or "/cuda/" not in path])
         + (relative("**/*.cu") if cuda else []),
         depends=[path for suffix in ("h", "cuh", "inl", "def") for path in relative(f"**/*.{suffix}")],
         include_dirs=[str(ROOT / "csrc")],
-        define_macros=[("TORCHPD_CUDA", None)] if cuda else [],
+        define_macros=[(f"TORCHPD_WITHOUT_{name.upper()}", None) for name in sorted(without)]
+        + ([("TORCHPD_CUDA", None)] if cuda else []),
         extra_compile_args={"cxx": cxx, "nvcc": [*TOOLKIT["NVCC_FLAGS"], *TOOLKIT["NVCC_PACKING"]]},
         extra_link_args=[*threads, *LINKING["shared_runtime"](compiler())],
     )

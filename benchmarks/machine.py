@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import fcntl
 import json
+import math
+import multiprocessing
 import os
 import shlex
 import statistics
@@ -110,19 +112,32 @@ def judge_scenes(
     run_scene: Callable[[int], Record],
     summary: Callable[[list[Record]], Record],
 ) -> None:
-    """Run a benchmark of random scenes from the command line, on one thread; rows in its file are kept."""
+    """Run a benchmark of random scenes from the command line, a thread each; rows in its file are kept."""
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=scenes, help="number of random scenes (%(default)s)")
+    parser.add_argument("--processes", type=int, default=1, help="how many run side by side (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="stop after these, with what is done")
     parser.add_argument("--out", type=Path, help="output file (JSON)")
+    parser.add_argument("--summary", action="store_true", help="write no rows, for very many scenes")
     options = parser.parse_args(words)
-    torch.set_num_threads(1)
-    now = describe_run(torch.device("cpu"), 1)
-    rows = {row["scene"]: row for row in earlier_rows(options.out)}
-    for number in tqdm(range(options.scenes), desc="scenes", unit="scene"):
-        if number in rows:
-            continue
-        rows[number] = {**run_scene(number), "run": run_of(now)}
-        if options.out:
-            every = list(rows.values())
-            write_result(options.out, {"schema": 1, **now, "summary": summary(every), "rows": every})
-    print(json.dumps(summary([rows[number] for number in range(options.scenes)]), indent=1))
+    now = describe_run(torch.device("cpu"), options.processes)
+    rows = {} if options.summary else {row["scene"]: row for row in earlier_rows(options.out)}
+    left = [number for number in range(options.scenes) if number not in rows]
+    begin = written = time.perf_counter()
+
+    def write() -> None:
+        kept = [rows[number] for number in sorted(rows)]
+        shown = [] if options.summary else kept
+        write_result(options.out, {"schema": 1, **now, "summary": summary(kept), "rows": shown})
+
+    with multiprocessing.get_context("spawn").Pool(options.processes, torch.set_num_threads, (1,)) as pool:
+        for row in tqdm(pool.imap_unordered(run_scene, left, chunksize=4), "scenes", len(left), unit="scene"):
+            rows[row["scene"]] = {**row, "run": run_of(now)}
+            if options.out and time.perf_counter() - written > 20.0:
+                write()
+                written = time.perf_counter()
+            if time.perf_counter() - begin > options.seconds:
+                break
+    if options.out:
+        write()
+    print(json.dumps(summary(list(rows.values())), indent=1))

@@ -7,9 +7,9 @@ namespace pd {
 // The constant arrays of a scene with contact. Vertices have the user's numbers, those of bodies first.
 template <class T>
 struct ContactPlan {
-  const int *triangle, *edge, *point;                    // [triangles, 3], [edges, 2], [points]
-  const int *body, *collider;                            // [vertices]; -1 for vertices of bodies
-  const int* touches_itself;                             // [bodies]
+  const int *triangle, *edge, *point;  // [triangles, 3], [edges, 2], [points]
+  const int *body, *collider;          // [vertices]; -1 for vertices of bodies
+  const int* touches_itself;           // [bodies]
   // Clusters of up to 32 sides of one body: of points, then of edges, then of triangles. A cluster
   // has the numbers of its sides, -1 past the last one, and their corners, the last one repeated.
   const int *leaves, *cluster_body;       // [clusters, 4, 32]; [clusters]

@@ -10,12 +10,16 @@ extern const Kernels kernels_avx512, kernels_avx2, kernels_portable;
 static std::vector<const Kernels*> supported() {
   std::vector<const Kernels*> found;
 #if defined(__x86_64__) && !defined(__clang__)
+#ifndef TORCHPD_WITHOUT_AVX512
   if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512vl") &&
       __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq")) {
     found.push_back(&kernels_avx512);
   }
+#endif
+#ifndef TORCHPD_WITHOUT_AVX2
   if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
     found.push_back(&kernels_avx2);
+#endif
 #endif
   found.push_back(&kernels_portable);
   return found;

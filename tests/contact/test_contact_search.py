@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,8 +67,8 @@ def level(size: float, cells: int, height: float) -> pd.TriMesh:
 
 
 def scene(several: bool) -> pd.Scene:
-    """Solids, a cloth that meets itself, and a collider; `several`: some of more than 32 clusters, and of less than one."""
-    bodies: list[object] = [
+    """Solids, a cloth that meets itself, and a collider; `several`: over 32 clusters, and bodies of less than one."""
+    bodies: list[Any] = [
         box((4, 4, 3), (0.0, 0.06, 0.0)),
         pd.Cloth(level(0.3, 24 if several else 9, 0.115), youngs=1e5, thickness=1e-3, area_density=0.2, bending=1e-5),
         pd.Collider(level(0.4, 5, 0.0)),
@@ -174,7 +175,7 @@ def check(of: Case, found: Found) -> Index:
 
 
 @pytest.mark.parametrize("several", [False, True])
-@pytest.mark.parametrize(("noise", "way"), [(0.0, 1e-4), (0.02, 1e-3), (0.3, 5e-3)])
+@pytest.mark.parametrize(("noise", "way"), [(0.0, 1e-4), (0.01, 3e-4), (0.3, 5e-3)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_pairs_are_those_of_brute_force(program: Path, several: bool, noise: float, way: float, seed: int) -> None:
     of = case(several, seed, noise, way)

@@ -26,12 +26,14 @@ from body_scenes import (
     two_cubes,
     two_sheets,
 )
+from cases import rotation
 from devices import require_gpu
 from on_gpu import GPU, host_waits
 from runs import noise
 from torch import Tensor
 
 import torchpd as pd
+from torchpd.plan.contact_plan import contact_plan
 
 require_gpu()
 
@@ -56,31 +58,58 @@ def on_gpu(course: Course, iterations: int, dtype: torch.dtype = torch.float64, 
     return simulator(course.scene, iterations, dtype=dtype, device=GPU, **options)
 
 
-@pytest.mark.parametrize("iterations", [4, 16, 64])
-@pytest.mark.parametrize("name", ["pressed cubes", *_COURSES])
+# No two distances are equal, else rounding decides between pairs: with flat faces and with symmetry a change of places by
+# 2e-16 changes a step on the CPU alone by 1e-6 to 1e-2 of its way.
+_WITHOUT_TIES: dict[str, tuple[Callable[[], Course], tuple[int, ...]]] = {
+    "pressed cubes": (pressed_cubes, (4, 16, 64)),
+    "two cubes": (two_cubes, (4, 16, 64)),
+    "gripper": (lambda: gripper(0.8, rotation(2.0, 9.0, 1.0)), (4, 16, 64)),
+    "plates": (lambda: plates(-0.002, turn=rotation(0.5, 9.0, 0.7))[0], (4, 16, 64)),
+    "ball on a sheet": (ball_on_sheet, (16,)),
+    "folded sheet": (lambda: folded_sheet(self_contact=True), (16, 64)),
+}
+
+
+def asking(sim: pd.Simulator, state: pd.HistoryState) -> pd.HistoryState:
+    """The state with a force within a body, which is dropped: the CPU takes no shorter step where boxes are apart."""
+    surface = contact_plan(sim.scene.values())
+    vertex, triangles = int(surface.triangles[0, 0]), surface.triangles
+    own = surface.body[triangles[:, 0]] == surface.body[vertex]
+    other = int(np.flatnonzero(own & (triangles != vertex).all(axis=1))[0])
+    given: Any = state.clone()
+    if bool((given.history.keys < 0).all()):
+        given.history.keys[:, 0] = vertex * len(triangles) + other
+        given.history.forces[:, 0, 0] = 1.0
+    return given  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize(
+    ("name", "iterations"), [(name, count) for name, (_, counts) in _WITHOUT_TIES.items() for count in counts]
+)
 def test_a_step_equals_that_of_the_cpu(name: str, iterations: int) -> None:
     """Each step from the state of the CPU: the same pairs, places to 1e-9 of the longest way, forces to 1e-6.
 
     Only sums over elements, energies and bodies have another order.
     """
-    course = pressed_cubes() if name == "pressed cubes" else _COURSES[name][0]()
+    course = _WITHOUT_TIES[name][0]()
     host, device = simulator(course.scene, iterations), on_gpu(course, iterations)
-    before = course.start(host)
-    for number, (state, info) in enumerate(course.steps(host, 12)):
+    before, touched = asking(host, course.start(host)), False
+    for number in range(12):
         given = None if course.targets is None else course.targets(number)
+        state, info = host(before, targets=given, return_info=True)
         moved = None if given is None else {part: value.to(device.rest_positions) for part, value in given.items()}
         own, report = device(before.to(GPU), targets=moved, return_info=True)
         way = max(float((state.positions - before.positions).abs().max()), 1e-6)
         assert float((own.positions.cpu() - state.positions).abs().max()) <= 1e-9 * way
         torch.testing.assert_close(own.history.poses.cpu(), state.history.poses, rtol=0.0, atol=1e-9)
-        if math.isfinite(float(info.contact_gap)):  # else the CPU looked for no pair
-            assert float(report.contact_gap) == pytest.approx(float(info.contact_gap), rel=1e-6)
+        assert float(report.contact_gap) == pytest.approx(float(info.contact_gap), rel=1e-6)
         assert float(report.held_back) == pytest.approx(float(info.held_back), rel=1e-6, abs=1e-12)
         most = float(state.history.forces.abs().max())
         normal, theirs = (s.history.forces[..., 0].sum().item() for s in (own, state))
         assert normal == pytest.approx(theirs, rel=1e-6, abs=1e-6 * most)
-        before = state
-    assert bool(before.history.forces.any())
+        touched = touched or bool(state.history.forces.any())
+        before = asking(host, state)
+    assert touched
 
 
 @pytest.mark.parametrize("iterations", [4, 16])

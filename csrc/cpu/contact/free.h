@@ -98,7 +98,8 @@ class FreeMotion {
   bool are_apart() const {
     for (int a = 0; a < plan_.bodies; ++a) {
       if (plan_.touches_itself[a] && has_surface(a) &&
-          !(shapes_.apart(SerialTeam(), a, places_.data()) > T(1.0 + slack_share) * plan_.thickness))
+          !(shapes_.apart(SerialTeam(), a, places_.data()) >
+            T(1.0 + slack_share) * plan_.thickness))
         return false;
       for (int b = a + 1; b < plan_.bodies; ++b) {
         const bool held = moves_by_hand(a) && moves_by_hand(b);

@@ -43,8 +43,7 @@ void contact_step_with(const StepCall<T>& call, const ContactCall<T>& contact,
   each_environment(
       list, threads, [&] { return ContactWork<T>(call, contact.plan); },
       [&](ContactWork<T>& own, std::int64_t e, const Team& alone) {
-        ContactStepper<T, HasContacts>(call, own.work, own.scratch, alone, e, contact,
-                                       own.memory)
+        ContactStepper<T, HasContacts>(call, own.work, own.scratch, alone, e, contact, own.memory)
             .rollout();
       });
 }

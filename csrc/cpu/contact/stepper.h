@@ -111,8 +111,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     if (!measures) return;
     const bool rests = steps_.is_at_rest();
     const ErrorShare share = schedule_[0].error_share(double(omega));
-    const bool met =
-        stop_[0].is_met(set_.tolerance, share, rests ? sums[0] : HUGE_VAL, sums[1]);
+    const bool met = stop_[0].is_met(set_.tolerance, share, rests ? sums[0] : HUGE_VAL, sums[1]);
     done_[0] = met && rests && sums[0] < HUGE_VAL;
   }
 
@@ -128,9 +127,8 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
     bool cuts = true;
     for (int n = 0; cuts && n < coarse_trials && steps_.begin_correction(alone_); ++n) {
       if constexpr (HasContacts) {
-        this->each_elastic_force([&](std::int64_t i, const Vec3<double>& force) {
-          this->keep_forces(i, force, 1.0);
-        });
+        this->each_elastic_force(
+            [&](std::int64_t i, const Vec3<double>& force) { this->keep_forces(i, force, 1.0); });
       }
       cuts = steps_.correct(alone_, [&](int i) { return this->forces_of(i); });
     }

@@ -44,9 +44,7 @@ int count_chunks(const ContactWork<T>& work) {
 
 template <class T>
 std::int64_t arrange(const ContactWork<T>& work, void* base, ContactMemory<T>& m) {
-  const auto each = [&](Arena& arena) {
-    arrange(arena, work.contact.plan, work.pieces, m.first);
-  };
+  const auto each = [&](Arena& arena) { arrange(arena, work.contact.plan, work.pieces, m.first); };
   Arena size(nullptr);
   each(size);
   m.stride = size.size();

@@ -11,7 +11,16 @@
 
 namespace pd {
 
-enum class ContactTask { start, go_first, begin_correction, correct, iterate, go_last, finish, write };
+enum class ContactTask {
+  start,
+  go_first,
+  begin_correction,
+  correct,
+  iterate,
+  go_last,
+  finish,
+  write
+};
 
 template <class T>
 struct ContactWork {
@@ -26,7 +35,8 @@ struct ContactWork {
   // of the runner
   T *x = nullptr, *u = nullptr, *before = nullptr, *target = nullptr, *planes = nullptr,
     *spheres = nullptr;
-  T* wall_forces = nullptr;  // [batch, planes and spheres, vertices, 4]: see cuda/rigid/contact_forces.h
+  T* wall_forces =
+      nullptr;  // [batch, planes and spheres, vertices, 4]: see cuda/rigid/contact_forces.h
   const double* sums = nullptr;  // [batch, sum_rows, sums_count]
   int sum_rows = 0;
   void* progress = nullptr;  // [batch]

@@ -152,8 +152,8 @@ class ContactApproach {
               low[0] = own < low[0] ? own : low[0];
             },
             most);
-        const T room = search_.shapes().apart(group, b, a_.place) -
-                       T(1.0 + slack_share) * plan_.thickness;
+        const T room =
+            search_.shapes().apart(group, b, a_.place) - T(1.0 + slack_share) * plan_.thickness;
         asked = !(T(-2) * T(most[0]) <= room);
       }
       if (group.leads()) a_.itself[b] = asked;
@@ -209,8 +209,8 @@ class ContactApproach {
   template <class Team, class Visit>
   PD_HD void each_between(const Team& team, T* shares, const Visit& visit) const {
     ContactNumbers& numbers = env_.numbers();
-    const bool meets = search_.fit(
-        team, [&](int v) { return swept(v); }, [&](int v) { return bow(v); }, true);
+    const bool meets =
+        search_.fit(team, [&](int v) { return swept(v); }, [&](int v) { return bow(v); }, true);
     if (meets) {
       team.once([&] { numbers.listed = 0; });
       search_.each_boxed(team, [&](const auto& found) {
@@ -222,9 +222,8 @@ class ContactApproach {
         const bool last = round + 1 == share_rounds;
         set_limits(team, shares);
         if (whole) {
-          team.each(listed, [&](int n) {
-            visit(a_.near_side[n].owner, a_.near_side[n].other, last);
-          });
+          team.each(listed,
+                    [&](int n) { visit(a_.near_side[n].owner, a_.near_side[n].other, last); });
         } else {
           search_.each_boxed(team, [&](const auto& found) {
             found.each([&](int owner, int other) { visit(owner, other, last); });
@@ -329,8 +328,9 @@ class ContactApproach {
     const bool rests = numbers.changed != 0;
     team.barrier();
     if (!rests) return;
-    lower_by_walls(team, a_.alone, [&](int b) { return has_rest(b); },
-                   [&](int v, T s) { return after(v, s); });
+    lower_by_walls(
+        team, a_.alone, [&](int b) { return has_rest(b); },
+        [&](int v, T s) { return after(v, s); });
     each_between(team, a_.alone,
                  [&](int owner, int other, bool last) { lower_alone(owner, other, last); });
   }
@@ -356,9 +356,8 @@ class ContactApproach {
       if (!has_rest(b)) continue;
       const T limit = a_.limit[b];
       const T share = pair.plane.frozen ? T(0) : share_below(limit, [&](T s) {
-        return is_allowed(after(v, s), anywhere, [&](const auto& visit) {
-          visit_space(pair.plane, pair.on_a(c), visit);
-        });
+        return is_allowed(after(v, s), anywhere,
+                          [&](const auto& visit) { visit_space(pair.plane, pair.on_a(c), visit); });
       });
       take(a_.alone, b, limit, share, last);
     }

@@ -15,9 +15,9 @@
 
 namespace pd::inline PD_TARGET {
 
-constexpr int cluster_bits = 5;       // 32 = 1 << 5
-constexpr int most_tree_levels = 6;   // for 2^30 clusters
-constexpr int leaf_rows = 4;          // of a cluster: numbers of sides, and their corners
+constexpr int cluster_bits = 5;      // 32 = 1 << 5
+constexpr int most_tree_levels = 6;  // for 2^30 clusters
+constexpr int leaf_rows = 4;         // of a cluster: numbers of sides, and their corners
 
 // The place of the lowest bit of a number that is not 0, which it loses.
 PD_HD int take_lowest(unsigned& bits) {
@@ -142,9 +142,9 @@ template <class T>
 struct ClusterBoxes {
   using Real = T;
 
-  const int* leaves;           // [clusters, 4, 32]
-  const int* body;             // [clusters]
-  Cluster<T>* box;             // [clusters]
+  const int* leaves;  // [clusters, 4, 32]
+  const int* body;    // [clusters]
+  Cluster<T>* box;    // [clusters]
   BoxTree<T> points, edges, triangles;
   const unsigned char *itself, *wanted, *by_hand;  // [bodies] see ContactArrays
 
@@ -152,9 +152,7 @@ struct ClusterBoxes {
   PD_HD bool has_points(int cluster) const { return cluster < points.count; }
   PD_HD const int* leaf(int cluster) const { return leaves + leaf_rows * cluster_size * cluster; }
   PD_HD const BoxTree<T>& tree_of(int cluster) const {
-    return cluster < points.count ? points
-           : cluster < owners()   ? edges
-                                  : triangles;
+    return cluster < points.count ? points : cluster < owners() ? edges : triangles;
   }
   PD_HD Box<T> hull(int cluster) const { return tree_of(cluster).hull(cluster); }
 

@@ -246,8 +246,8 @@ class ContactCorrection {
       for (int c = 0; c < 4; ++c) {
         if (of.on_a(c) != (s == 0)) continue;
         const double share = s == 0 ? double(of.near.weight[c]) : -double(of.near.weight[c]);
-        pair.side[s].arm = multiply_add(share, position(a_.inside[of.vertex[c]]) - center,
-                                        pair.side[s].arm);
+        pair.side[s].arm =
+            multiply_add(share, position(a_.inside[of.vertex[c]]) - center, pair.side[s].arm);
       }
     }
     pair.normal = wide(of.normal);
@@ -486,8 +486,7 @@ class ContactCorrection {
     const auto vertex = body_.vertex(i);
     CoarseVertex<double> v = coarse_vertex(i);
     const Vec3<T> u = BodyState<T>::read(body_.u, i);
-    const Vec3<T> moved =
-        vertex.displaced(u, narrow(a_.coarse_body[g].motion().of(v.x + v.u)));
+    const Vec3<T> moved = vertex.displaced(u, narrow(a_.coarse_body[g].motion().of(v.x + v.u)));
     v.u = wide(moved);
     const Vec3<T> out = vertex.displaced(moved, narrow(push_of(env_.walls, v, forces)));
     return vertex.project(env_.walls, out, out) - moved;

@@ -40,7 +40,7 @@ struct ContactNumbers {
   int waits, checked;
   // of an iteration
   int active, outside, loaded, cut, stopped, meets, changed;
-  int listed;  // near pairs that were found, listed or not
+  int listed;                                     // near pairs that were found, listed or not
   int corrects, searching, leaves, cuts, pushes;  // of a coarse correction
   int moved, changes[contact_sweeps];  // vertices of active pairs; whether sweeps change a force
 };
@@ -135,11 +135,12 @@ struct ContactArrays {
   T *share, *least, *bound;             // [colliders]
   int* barred;                          // [colliders]
   // of the coarse correction
-  int *inside, *component;  // [vertices] of bodies: internal number; component that moves rigidly, or -1
-  CoarseBody* coarse_body;                              // [components]
-  CoarseIsland* island;                                 // [components] by its least member
-  RigidMotion<double>* motion;                          // [components]
-  double *coarse_sum, *newton, *matrix;                 // [components, 31], [components, 18], [components^2, 36]
+  int *inside,
+      *component;  // [vertices] of bodies: internal number; component that moves rigidly, or -1
+  CoarseBody* coarse_body;               // [components]
+  CoarseIsland* island;                  // [components] by its least member
+  RigidMotion<double>* motion;           // [components]
+  double *coarse_sum, *newton, *matrix;  // [components, 31], [components, 18], [components^2, 36]
   double *coarse_share, *coarse_joint, *coarse_limit;   // [components]
   int *root, *size, *first, *local, *member;            // [components] of islands
   int *component_begin, *component_end, *coarse_group;  // [components]
@@ -147,7 +148,7 @@ struct ContactArrays {
   unsigned char *valid, *touches, *couple, *joins;  // [components], [components^2], [capacity]
   PairTerms* terms;                                 // [capacity]
   double* radius;                                   // [capacity] of friction; of a check, psi
-  T* most;                              // [colliders + 2]: held back, pins held back, least d / r
+  T* most;  // [colliders + 2]: held back, pins held back, least d / r
   // of the search
   Cluster<T>*cluster, *group;  // [clusters] boxes of sides; [groups] of trees over clusters
   SidePair* near_side;         // [near pairs] in any order
@@ -212,8 +213,7 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   arena.place(a.coarse_sum, ContactSums::count * g);
   arena.place(a.newton, 18 * g);
   arena.place(a.matrix, 36 * g * g);
-  for (double** array : {&a.coarse_share, &a.coarse_joint, &a.coarse_limit})
-    arena.place(*array, g);
+  for (double** array : {&a.coarse_share, &a.coarse_joint, &a.coarse_limit}) arena.place(*array, g);
   for (int** array : {&a.root, &a.size, &a.first, &a.local, &a.member, &a.component_begin,
                       &a.component_end, &a.coarse_group})
     arena.place(*array, g);
@@ -239,12 +239,13 @@ constexpr int contact_array_pointers = int(sizeof(ContactArrays<float>) / sizeof
 // The deforming vertices of a step, by internal number: four numbers each, but for `inverse` and `inertia`.
 template <class T>
 struct BodyState {
-  const int *order, *component;    // user's number; component that moves rigidly, or -1
-  const T* x;                      // at the start of the step
-  T *u, *before;                   // displacement of the iterate, and of the one before
-  T *target, *saved, *free;        // s; before a coarse correction; of the free iterate, with planes and spheres
-  const T *inverse, *inertia;      // every `stride` numbers
-  const T* mass;                   // by the user's number
+  const int *order, *component;  // user's number; component that moves rigidly, or -1
+  const T* x;                    // at the start of the step
+  T *u, *before;                 // displacement of the iterate, and of the one before
+  T *target, *saved,
+      *free;  // s; before a coarse correction; of the free iterate, with planes and spheres
+  const T *inverse, *inertia;  // every `stride` numbers
+  const T* mass;               // by the user's number
   int stride, vertices, components;
 
   PD_HD static Vec3<T> read(const T* of, int i) {

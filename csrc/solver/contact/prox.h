@@ -26,8 +26,9 @@ class ContactProx {
     if (active == 0) return;
     push(team, active, moved, c, true);
     for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
-      team.template blocks<T>(
-          active, [&](const auto& lanes) { advance<Team>(lanes, numbers.changes[sweep], sweep == 0); });
+      team.template blocks<T>(active, [&](const auto& lanes) {
+        advance<Team>(lanes, numbers.changes[sweep], sweep == 0);
+      });
       // a further sweep would change nothing either
       if (!numbers.changes[sweep]) break;
       push(team, active, moved, c, false);

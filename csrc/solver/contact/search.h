@@ -86,10 +86,14 @@ class ContactSearch {
   // rows of `point`, then edges; of two edges the lesser one. None shares a vertex.
   template <class Team, class Visit>
   PD_HD void each_boxed(const Team& team, const Visit& visit) const {
-    team.template walk<T>(boxes_, [&](int cluster, int own, int other) {
-      const bool point = boxes_.has_points(cluster), swaps = !point && other < own;
-      return SidePair{(point ? 0 : env_.plan.points) + (swaps ? other : own), swaps ? own : other};
-    }, visit);
+    team.template walk<T>(
+        boxes_,
+        [&](int cluster, int own, int other) {
+          const bool point = boxes_.has_points(cluster), swaps = !point && other < own;
+          return SidePair{(point ? 0 : env_.plan.points) + (swaps ? other : own),
+                          swaps ? own : other};
+        },
+        visit);
   }
 
   PD_HD ContactPair<T> sides_of(int owner, int other) const {
@@ -187,16 +191,17 @@ class ContactSearch {
       });
     }
     team.each(count, [&](int p) { find_pair(a.owner[p], a.partner[p], a.pair[p]); });
-    team.each_closest(count, [&](int p) -> const auto& { return a.pair[p]; }, a.place,
-                      [&](int p, const Closest<T>& near) {
-      ContactPair<T>& pair = a.pair[p];
-      pair.near = near;
-      make_plane(pair, a.place, a.target, pair.near, Vec3<T>{});
-      pair.normal = pair.normal_at(pair.near);
-      pair.force = force_of(pair.key, first, before);
-      pair.force.tangential = tangential(pair.force.tangential, pair.normal);
-      for (int v : pair.vertex) count_one(a.cursor + v);
-    });
+    team.each_closest(
+        count, [&](int p) -> const auto& { return a.pair[p]; }, a.place,
+        [&](int p, const Closest<T>& near) {
+          ContactPair<T>& pair = a.pair[p];
+          pair.near = near;
+          make_plane(pair, a.place, a.target, pair.near, Vec3<T>{});
+          pair.normal = pair.normal_at(pair.near);
+          pair.force = force_of(pair.key, first, before);
+          pair.force.tangential = tangential(pair.force.tangential, pair.normal);
+          for (int v : pair.vertex) count_one(a.cursor + v);
+        });
     index(team, count);
   }
 
@@ -205,8 +210,8 @@ class ContactSearch {
     const ContactPlan<T>& plan = env.plan;
     const ContactArrays<T>& a = env.a;
     const int points = plan.point_clusters, edges = plan.edge_clusters;
-    Cluster<T>*const of_edges = a.group + count_groups(points),
-               *const of_triangles = of_edges + count_groups(edges);
+    Cluster<T>*const of_edges = a.group + count_groups(points), *const of_triangles =
+                                                                    of_edges + count_groups(edges);
     return {plan.leaves,
             plan.cluster_body,
             a.cluster,
@@ -250,8 +255,8 @@ class ContactSearch {
             },
             least);
         const T wanted = T(-least[0]), needed = wanted < most ? wanted : most,
-                room = T(0.5) * (shapes_.apart(group, b, a.place) -
-                                 T(1.0 + slack_share) * plan.thickness);
+                room = T(0.5) *
+                       (shapes_.apart(group, b, a.place) - T(1.0 + slack_share) * plan.thickness);
         if (room >= needed) {
           itself = false;
           most = room < most ? room : most;
@@ -265,13 +270,14 @@ class ContactSearch {
   template <class Team, class Radius, class Visit>
   PD_HD void each_near(const Team& team, const Radius& radius, const Visit& visit) const {
     each_boxed(team, [&](const auto& found) {
-      found.each_closest([&](int owner, int other) { return sides_of(owner, other); },
-                         env_.a.place, [&](int owner, int other, const Closest<T>& near) {
-        ContactPair<T> pair = sides_of(owner, other);
-        pair.near.distance = near.distance;
-        if (pair.is_within(radius, env_.plan.thickness) && find_pair(owner, other, pair))
-          visit(owner, other, near.distance);
-      });
+      found.each_closest(
+          [&](int owner, int other) { return sides_of(owner, other); }, env_.a.place,
+          [&](int owner, int other, const Closest<T>& near) {
+            ContactPair<T> pair = sides_of(owner, other);
+            pair.near.distance = near.distance;
+            if (pair.is_within(radius, env_.plan.thickness) && find_pair(owner, other, pair))
+              visit(owner, other, near.distance);
+          });
     });
   }
 

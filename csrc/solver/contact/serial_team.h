@@ -159,8 +159,8 @@ class SerialTeam {
         unsigned meets = lanes.which([&](int n) { return to.box(n).meets(box); });
         if (own == other) meets &= ~1u << i;
         if (meets == 0) continue;
-        meets &= lanes.which(
-            [&](int n) { return boxes.share_none(point, leaf, i, leaf_of_other, n); });
+        meets &=
+            lanes.which([&](int n) { return boxes.share_none(point, leaf, i, leaf_of_other, n); });
         while (meets != 0) {
           if (found.count == Found::most) visit(found), found.count = 0;
           found.side[found.count++] = sides(own, leaf[i], leaf_of_other[take_lowest(meets)]);

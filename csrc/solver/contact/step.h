@@ -14,7 +14,13 @@ class ContactSteps {
   using Env = ContactEnvironment<T>;
 
   PD_HD explicit ContactSteps(const Env& env)
-      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env), correction_(env, search_), prox_(env) {}
+      : env_(env),
+        plan_(env.plan),
+        a_(env.a),
+        body_(env.body),
+        search_(env),
+        correction_(env, search_),
+        prox_(env) {}
 
   // A step begins at the places of bodies; poses are those of colliders, actual ones and those of the step's end.
   template <class Team>

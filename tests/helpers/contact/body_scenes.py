@@ -142,9 +142,9 @@ def ball_on_sheet(speed: float = 20.0, *, contact: bool = True) -> Course:
     return Course(scene, each(scene, (0.0, 0.0, 0.0), (0.0, -speed, 0.0)))
 
 
-def gripper(friction: float) -> Course:
+def gripper(friction: float, turn: Array | None = None) -> Course:
     """Two fingers close on a cube of .05 m within .3 s, 5 mm deep each, then lift by .1 m within .5 s."""
-    cube = block(0.05, 2, (0.0, 0.025, 0.0))
+    cube = block(0.05, 2, (0.0, 0.025, 0.0), turn)
     finger = pd.shapes.box((0.02, 0.055, 0.04), (1, 2, 2))
     at = finger.vertices.mean(axis=0)
     left = pd.Collider(finger.translated(np.array([-0.045, 0.0325, 0.0]) - at))
@@ -169,9 +169,9 @@ def slope(degrees: float, friction: float, *, speed: float = 0.0, lift: float = 
     return Course(scene, each(scene, tuple(turn @ np.array([speed, 0.0, 0.0]))))
 
 
-def plates(to: float, seconds: float = 0.2) -> tuple[Course, pd.Collider, pd.Collider]:
+def plates(to: float, seconds: float = 0.2, turn: Array | None = None) -> tuple[Course, pd.Collider, pd.Collider]:
     """A cube of .1 m between two plates that close to a distance `to`, negative: past each other; then they open."""
-    cube = block(0.1, 2, (0.0, 0.0, 0.0))
+    cube = block(0.1, 2, (0.0, 0.0, 0.0), turn)
     upper, lower = (pd.Collider(plane(0.4, 0.4, 4), pose=(0.0, side * 0.053, 0.0, 1, 0, 0, 0)) for side in (1, -1))
     scene = pd.Scene(cube, upper, lower, pd.Contact(thickness=THICKNESS))
     speed = (0.053 - 0.5 * to) / seconds

@@ -33,15 +33,14 @@ const Number* read() {
 int main() {
   const int* sizes = read<int>();
   ContactPlan<double> plan;
-  int* const counts[] = {&plan.vertices, &plan.body_vertices, &plan.triangles,
-                         &plan.edges,    &plan.points,        &plan.bodies,
-                         &plan.colliders, &plan.capacity,     &plan.clusters,
-                         &plan.point_clusters, &plan.edge_clusters};
+  int* const counts[] = {&plan.vertices, &plan.body_vertices,  &plan.triangles,    &plan.edges,
+                         &plan.points,   &plan.bodies,         &plan.colliders,    &plan.capacity,
+                         &plan.clusters, &plan.point_clusters, &plan.edge_clusters};
   for (int* count : counts) *count = *sizes++;
   plan.rest_pairs = *sizes;
-  for (const int** array : {&plan.triangle, &plan.edge, &plan.point, &plan.body, &plan.collider,
-                            &plan.touches_itself, &plan.leaves, &plan.cluster_body,
-                            &plan.body_start})
+  for (const int** array :
+       {&plan.triangle, &plan.edge, &plan.point, &plan.body, &plan.collider, &plan.touches_itself,
+        &plan.leaves, &plan.cluster_body, &plan.body_start})
     *array = read<int>();
   plan.surface_start = plan.body_start + plan.bodies + 1;
   plan.rest_key = read<std::int64_t>();
