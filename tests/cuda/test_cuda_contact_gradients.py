@@ -37,12 +37,15 @@ NAMES = ("positions", "velocities", "forces", "end", "start", "friction", "thick
 
 
 def pressed() -> Step:
-    """Cubes that pins hold and press on each other: each force is the only one that balances."""
+    """Cubes that pins hold and press on each other: 18 pairs with forces, most of which stick."""
     course = pressed_cubes()
     sim = simulator(course.scene, CONVERGED)
     state: Any = course.start(sim)
     for number in range(11):
-        state = sim(state, targets=course.targets(number))  # type: ignore[misc]
+        targets = course.targets(number)  # type: ignore[misc]
+        state = sim(state, targets=targets)
+    (held,) = targets.values()
+    sim.pin_targets[..., -len(held) :, :] = held  # for the next step, too
     return Step(sim, state)
 
 
@@ -129,19 +132,22 @@ class Saved:
 
 
 def on_gpu(step: Step, dtype: torch.dtype = torch.float64) -> pd.Simulator:
-    return simulator(step.sim.scene, CONVERGED, dtype=dtype, device=GPU)
+    sim = simulator(step.sim.scene, CONVERGED, dtype=dtype, device=GPU)
+    sim.pin_targets.copy_(step.sim.pin_targets)
+    return sim
 
 
 @pytest.mark.parametrize("name", STEPS)
 def test_the_gradients_of_the_cpu(name: str) -> None:
-    """The same state, pairs and forces: to 1e-9, and to 1e-10 where no forces can share a load.
+    """The same state, pairs and forces: to 1e-9, ten times the residual at which both solves stop.
 
-    Only sums have another order. Pins whose target bodies keep them from have no gradient on either.
+    Only sums have another order. For the pressed cubes to 1e-8: an ulp of the places changes their gradients by 8e-10
+    on the CPU. Pins whose target bodies keep them from have no gradient on either.
     """
     saved = Saved.of(STEPS[name]())
     sim = on_gpu(saved.step)
     wanted, found = saved.gradients(saved.step.sim), saved.gradients(sim)
-    least = 1e-10 if name == "pressed cubes" else 1e-9
+    least = 1e-8 if name == "pressed cubes" else 1e-9
     most = {key: relative(found[key], wanted[key]) for key in wanted if wanted[key].any()}
     assert max(most.values()) <= least, most
     assert all(not found[key].any() for key in wanted if not wanted[key].any())
@@ -154,6 +160,7 @@ def test_float32(make: Callable[[], Step]) -> None:
     saved = Saved.of(make())
     wanted = saved.gradients(saved.step.sim)
     single = simulator(saved.step.sim.scene, CONVERGED, dtype=torch.float32)
+    single.pin_targets.copy_(saved.step.sim.pin_targets)
     host, found = saved.gradients(single), saved.gradients(on_gpu(saved.step, torch.float32))
     for key in ("positions", "velocities", "forces"):
         assert found[key].dtype == torch.float32
