@@ -243,7 +243,7 @@ def at_rest(motion: Motion, path: Array) -> Row:
     lower, upper = np.split(path, 2, axis=1)
     start = lower[0][:, 1], upper[0][:, 1]
     gap = upper[-1, start[1] == start[1].min(), 1].mean() - lower[-1, start[0] == start[0].max(), 1].mean()
-    slid = (upper[-1] - upper[motion.steps // 2]).mean(axis=0)
+    slid = (upper[-1] - upper[len(path) // 2]).mean(axis=0)
     return {"gap": float(gap), "drift": float(np.hypot(slid[0], slid[2])), "fall": float(-slid[1])}
 
 
