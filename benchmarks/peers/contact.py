@@ -11,8 +11,8 @@ How far it is from the one with half as many stands beside it. Crossings are pai
 step, by exact signs.
 
 Contact is not the same model. Here, surfaces rest exactly a thickness apart. In VBD, a penalty (N/m for each pair) acts
-below that distance, and a log barrier below half of it; Divide-and-Truncate is on. Its planes are those of the last
-detection: before iterations k, 2k and so on. Between two detections a vertex moves by 0.425 (margin + gap) at most.
+below that distance, and a log barrier below half of it. Divide-and-Truncate is on, with pairs detected before every
+fifth iteration. Between two detections a vertex moves by 0.425 times the detection's reach at most.
 
     python -m benchmarks.peers.contact --out benchmarks/results/peers-contact-cpu.json
 
