@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 _RELAXATION = 0.1  # of XPBD: the default 0.9 diverges on these meshes; 0.3 diverges or converges elsewhere
 
 
-def _packages() -> tuple[Any, Any]:
+def packages() -> tuple[Any, Any]:
     try:
         import newton
         import warp
@@ -39,11 +39,11 @@ def _packages() -> tuple[Any, Any]:
 
 
 def versions() -> dict[str, str]:
-    newton, warp = _packages()
+    newton, warp = packages()
     return {"newton": newton.__version__, "warp": warp.__version__}
 
 
-def _neo_hookean_cloth(builder: Any, problem: Sheet, body: dict[str, Any]) -> None:
+def neo_hookean_cloth(builder: Any, problem: Sheet, body: dict[str, Any]) -> None:
     builder.add_cloth_mesh(
         **body, density=AREA_DENSITY, tri_ke=problem.youngs / 2.0, tri_ka=0.0, tri_kd=0.0, edge_kd=0.0
     )  # fmt: skip
@@ -56,7 +56,7 @@ def _neo_hookean_cloth(builder: Any, problem: Sheet, body: dict[str, Any]) -> No
 
 
 def _style3d_cloth(builder: Any, problem: Sheet, body: dict[str, Any]) -> None:
-    newton, warp = _packages()
+    newton, warp = packages()
     newton.solvers.SolverStyle3D.register_custom_attributes(builder)
     newton.solvers.style3d.add_cloth_mesh(
         builder, **body, density=AREA_DENSITY,
@@ -68,7 +68,7 @@ def _style3d_cloth(builder: Any, problem: Sheet, body: dict[str, Any]) -> None:
 
 
 def _model(problem: Problem, device: str, lame: float, add: Callable[..., None]) -> Any:
-    newton, warp = _packages()
+    newton, warp = packages()
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=problem.gravity)
     body = {
         "pos": warp.vec3(0.0, 0.0, 0.0), "rot": warp.quat_identity(), "scale": 1.0, "vel": warp.vec3(0.0, 0.0, 0.0),
@@ -90,9 +90,9 @@ def _model(problem: Problem, device: str, lame: float, add: Callable[..., None])
 
 
 def _method(
-    problem: Problem, device: str, name: str, note: str, lame: float, add: Callable[..., None] = _neo_hookean_cloth
+    problem: Problem, device: str, name: str, note: str, lame: float, add: Callable[..., None] = neo_hookean_cloth
 ) -> Method:
-    newton, warp = _packages()
+    newton, warp = packages()
     model = _model(problem, device, lame, add)
     before, after, control = model.state(), model.state(), model.control()
     positions = problem.start.astype(np.float32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 from pathlib import Path
 from typing import Any
@@ -136,3 +137,25 @@ def test_what_is_not_installed_is_named(
     problem = peers("problem").beam(1, 1e5)
     with pytest.raises(peers("problem").MissingPackageError, match=f"left out.*pip install.*{missing}"):
         getattr(peers(module), make)(problem, "cpu")
+
+
+def test_motions_with_contact_are_judged_by_their_own_and_crossings_are_counted(peers: Any, monkeypatch: Any) -> None:
+    contact = peers("contact")
+    monkeypatch.setattr(contact, "COUNTS", [4, 64])
+    motion = dataclasses.replace(contact.cube_rests(), steps=4, longest=256)
+    run = functools.partial(contact.ours, motion)
+    row = contact.measure(motion, run, functools.partial(run, dtype=torch.float64), None)
+    assert row["settled"] < 1e-3
+    coarse, fine = row["points"]
+    assert fine["error"] < 0.1 * coarse["error"]
+    assert row["crossings_converged"] == coarse["crossings"] == fine["crossings"] == 0
+    half = len(motion.start) // 2
+    sunk = np.stack([motion.start] * 2)
+    sunk[1, half:, 1] -= 0.01
+    assert contact.count_crossings(motion, sunk) > 0
+    assert contact.at_rest(motion, sunk)["gap"] == pytest.approx(-0.009)
+    peer = {**row, "method": "Newton VBD", "penalty": 1e3}
+    own = {**row, "method": "torchpd", "penalty": None}
+    for of, name in ((own, "cube rests"), (peer, "cube rests")):
+        of["motion"] = name
+    assert contact.table([own, peer]).count("1.0 x") == len(contact.GOALS)
