@@ -462,7 +462,7 @@ def _draw_contact(rows: list[Row], path: Path, _: str) -> Path:
         axis.set_xscale("log")
         axis.set_xlabel(axis_label(name))
         _error_axis(axis, [down(row) for row in rows], label)
-    axes[0].legend(frameon=False, fontsize=9, loc="lower left")
+    figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, loc="outside right upper", fontsize=9)
     _note_uncertain(figure, rows)
     figure.savefig(path)
     return path
