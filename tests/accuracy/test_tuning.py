@@ -12,7 +12,7 @@ from runs import simulator, state_of
 from tuning_cases import CANDIDATES, bar, swinging, worst_error
 
 import torchpd as pd
-from torchpd.accuracy import tuning
+from torchpd.accuracy import tuning, tuning_study
 from torchpd.accuracy.candidates import safe_candidates
 from torchpd.accuracy.error import ExactStep, exact_steps, settled_steps
 from torchpd.accuracy.tuning import TuningWarning
@@ -87,7 +87,7 @@ def test_out_of_reach_is_said_with_the_best_there_is() -> None:
 def test_doubt_about_the_converged_step_counts_as_error(monkeypatch: pytest.MonkeyPatch) -> None:
     sim = bar()
     unsure = [dataclasses.replace(step, uncertainty=0.2) for step in exact_steps(sim, swinging(sim))]
-    monkeypatch.setattr(tuning, "exact_steps", lambda *_, **__: unsure * 7)
+    monkeypatch.setattr(tuning_study, "exact_steps", lambda *_, **__: unsure * 7)
     assert sim.tune(swinging(sim), error=0.5).studied_error >= 0.2
 
 
@@ -98,7 +98,7 @@ def test_without_a_converged_step_there_is_no_result(
     """And what the user has set stays."""
     sim = bar(solver=pd.Multilevel(), iterations=9)
     unsure = [dataclasses.replace(step, uncertainty=14.0) for step in exact_steps(sim, swinging(sim))]
-    monkeypatch.setattr(tuning, "exact_steps", lambda *_, **__: unsure * 7)
+    monkeypatch.setattr(tuning_study, "exact_steps", lambda *_, **__: unsure * 7)
     with pytest.raises(RuntimeError, match=r"converged .*1\.4e\+01"):
         sim.tune(swinging(sim), **request_)  # type: ignore[arg-type]
     assert (sim.solver, sim.iterations, sim.tuning_result) == (pd.Multilevel(), 9, None)
@@ -315,7 +315,7 @@ def test_steps_without_an_end_attain_nothing(monkeypatch: pytest.MonkeyPatch) ->
         steps = settled_steps(*given, **named)  # type: ignore[arg-type]
         return [dataclasses.replace(step, uncertainty=0.2) for step in steps]
 
-    monkeypatch.setattr(tuning, "settled_steps", unsettled)
+    monkeypatch.setattr(tuning_study, "settled_steps", unsettled)
     sim, state = sliding(1e5)
     with pytest.warns(TuningWarning, match="error 0.01 not reached"):
         result = sim.tune(state, error=1e-2, most=128)

@@ -125,9 +125,9 @@ def momentum_error(sim: Simulator, state: HistoryState, after: HistoryState, tar
 def contact_rows(bench: Bench, name: str, counts: list[int], *, steps: int = _STEPS) -> list[Row]:
     """A step of a scene in float32 at several iteration counts, against its converged step in float64.
 
-    `error` is that of the step, with friction; `more` has the least gap over the thickness, the error of the momentum,
-    crossings (0 or 1, by exact signs), pairs, and `path`: the largest distance of a vertex from the motion of 1024
-    iterations, over the largest displacement.
+    `error` is that of the step, with friction. `more` has `gap`, the least distance over the thickness, `momentum`, see
+    `momentum_error`, `crosses`, 0 or 1 by exact signs, and `path`. That is the largest distance of a vertex from the
+    motion of 1024 iterations, over the largest displacement.
     """
     scene = CONTACT_SCENES[name]
     sim = scene.simulator(torch.float32, _CONVERGED).to(bench.device)
