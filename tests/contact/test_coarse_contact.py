@@ -90,3 +90,23 @@ def test_corrections_do_not_swing() -> None:
     *_, (_, info) = course.steps(sim, 13)
     assert float(info.residual) < 1e-2
     assert float(info.contact_gap) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_held_body_stays_where_pins_let_go_elsewhere() -> None:
+    """A cube lies on one whose pins hold; in another environment they let go. The held one moves as in a scene alone."""
+    low, top = cube(1e5, 0.0, 0.05, 0.0), cube(1e5, 0.03, 0.1511, 0.02)
+    pin = pd.Pin(low, low.mesh.vertices[:, 1] < 1e-9)
+    scene = pd.Scene(low, top, pin, pd.Contact(friction=0.5, thickness=THICKNESS), gravity())
+    ends = []
+    for batch in (1, 2):
+        sim = simulator(scene, 64)
+        if batch > 1:
+            sim.set_material(pin_hard=torch.tensor([[True], [False]]).expand(2, len(sim.pin_hard)))
+        state = sim.rest_state(batch)
+        for _ in range(12):
+            state, info = sim(state, return_info=True)
+        ends.append(state.positions)
+        assert float(info.residual[0]) < 5e-3
+    alone, beside = ends
+    assert float((beside[0] - alone[0]).norm(dim=1).max()) < 1e-5
+    assert float((beside[1] - alone[0]).norm(dim=1).max()) > 0.05  # it fell

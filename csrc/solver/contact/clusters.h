@@ -130,10 +130,10 @@ class ClusterWalk {
     which_[level_] = which;
   }
 
-  BoxTree<T> tree_;
-  Box<T> box_;
-  const Cluster<T>* groups_;  // of the level
-  int least_, top_, level_, node_;
+  BoxTree<T> tree_ = {};
+  Box<T> box_ = {};
+  const Cluster<T>* groups_ = nullptr;  // of the level
+  int least_ = 0, top_ = 0, level_ = 0, node_ = 0;
   unsigned which_[most_tree_levels];
 };
 

@@ -36,15 +36,7 @@ class ContactCorrection {
       a_.component_begin[g] = plan_.body_vertices, a_.component_end[g] = 0;
     });
     team.spread(pairs, [&](int p) {
-      a_.joins[p] = joins(a_.pair[p]);
-      if (!a_.joins[p]) return;
-      numbers.corrects = 1;
-      const int a = component_of(p, 0), b = component_of(p, 1);
-      if (a >= 0) count_one(a_.side_start + a);
-      if (b >= 0) count_one(a_.side_start + b);
-      if (a < 0 || b < 0) return;
-      a_.couple[std::int64_t(a) * count + b] = a_.couple[std::int64_t(b) * count + a] = 1;
-      join(a_.root, a, b);
+      if (is_between(a_.pair[p])) numbers.corrects = 1;
     });
     team.each(plan_.body_vertices, [&](int v) {
       const int g = a_.component[v];
@@ -53,6 +45,17 @@ class ContactCorrection {
       raise(a_.component_end + g, v + 1);
     });
     if (!numbers.corrects) return;
+    team.groups(count, [&](int g, const auto& group) { sum_body(g, group); });
+    team.each(pairs, [&](int p) {
+      a_.joins[p] = joins(a_.pair[p]);
+      if (!a_.joins[p]) return;
+      const int a = component_of(p, 0), b = component_of(p, 1);
+      if (a >= 0) count_one(a_.side_start + a);
+      if (b >= 0) count_one(a_.side_start + b);
+      if (a < 0 || b < 0) return;
+      a_.couple[std::int64_t(a) * count + b] = a_.couple[std::int64_t(b) * count + a] = 1;
+      join(a_.root, a, b);
+    });
     team.scan(a_.side_start, count);
     team.groups(count, [&](int g, const auto& group) {
       if (a_.side_start[g] == a_.side_start[g + 1]) return;
@@ -62,7 +65,6 @@ class ContactCorrection {
             return a_.joins[p] && (component_of(p, 0) == g || component_of(p, 1) == g);
           },
           a_.side_pair + a_.side_start[g]);
-      sum_body(g, group);
     });
     team.once([&] { lay_out(); });
     team.each(pairs, [&](int p) {
@@ -150,13 +152,21 @@ class ContactCorrection {
   PD_HD static Vec3<double> wide(const Vec3<T>& a) { return widened<double>(a); }
   PD_HD static Vec3<T> narrow(const Vec3<double>& a) { return {T(a.x), T(a.y), T(a.z)}; }
 
-  PD_HD int component_at(int v) const { return v < plan_.body_vertices ? a_.component[v] : -1; }
+  // -1: none, or pins leave it no rigid motion
+  PD_HD int component_at(int v) const {
+    const int g = v < plan_.body_vertices ? a_.component[v] : -1;
+    return g >= 0 && a_.goes[g] ? g : -1;
+  }
   PD_HD int component_of(int p, int side) const {
     return component_at(a_.pair[p].vertex[side == 0 ? 0 : 3]);
   }
   PD_HD int root_of_pair(int p) const {
     const int a = component_of(p, 0);
     return a_.root[a >= 0 ? a : component_of(p, 1)];
+  }
+  PD_HD bool is_between(const ContactPair<T>& pair) const {
+    const auto component = [&](int v) { return v < plan_.body_vertices ? a_.component[v] : -1; };
+    return component(pair.vertex[0]) != component(pair.vertex[3]);
   }
   // a pair of different components that can yield
   PD_HD bool joins(const ContactPair<T>& pair) const {
@@ -208,6 +218,7 @@ class ContactCorrection {
                 : n < S::pins        ? moments[n - S::target_offset]
                                      : pins[n - S::pins];
     a_.coarse_body[g] = CoarseBody(RigidBody(sums));
+    a_.goes[g] = a_.coarse_body[g].moves();
   }
 
   // Members of islands, one after another.

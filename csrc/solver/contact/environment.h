@@ -145,10 +145,11 @@ struct ContactArrays {
   int *root, *size, *first, *local, *member;            // [components] of islands
   int *component_begin, *component_end, *coarse_group;  // [components]
   int *side_start, *side_pair;  // [components + 1], [2 capacity] pairs of each component
-  unsigned char *valid, *touches, *couple, *joins;  // [components], [components^2], [capacity]
-  PairTerms* terms;                                 // [capacity]
-  double* radius;                                   // [capacity] of friction; of a check, psi
-  T* most;  // [colliders + 2]: held back, pins held back, least d / r
+  unsigned char *valid, *touches, *goes, *couple,
+      *joins;        // [components], [components^2], [capacity]
+  PairTerms* terms;  // [capacity]
+  double* radius;    // [capacity] of friction; of a check, psi
+  T* most;           // [colliders + 2]: held back, pins held back, least d / r
   // of the search
   Cluster<T>*cluster, *group;  // [clusters] boxes of sides; [groups] of trees over clusters
   SidePair* near_side;         // [near pairs] in any order
@@ -219,7 +220,7 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
     arena.place(*array, g);
   arena.place(a.side_start, g + 1);
   arena.place(a.side_pair, g > 0 ? 2 * m : 0);
-  for (unsigned char** array : {&a.valid, &a.touches}) arena.place(*array, g);
+  for (unsigned char** array : {&a.valid, &a.touches, &a.goes}) arena.place(*array, g);
   arena.place(a.couple, g * g);
   arena.place(a.joins, g > 0 ? m : 0);
   arena.place(a.terms, g > 0 ? m : 0);
