@@ -93,7 +93,7 @@ def test_corrections_do_not_swing() -> None:
 
 
 def test_a_held_body_stays_where_pins_let_go_elsewhere() -> None:
-    """A cube lies on one whose pins hold; in another environment they let go. The held one moves as in a scene alone."""
+    """A cube lies on one whose pins hold; in another environment they let go. The held one moves as if alone."""
     low, top = cube(1e5, 0.0, 0.05, 0.0), cube(1e5, 0.03, 0.1511, 0.02)
     pin = pd.Pin(low, low.mesh.vertices[:, 1] < 1e-9)
     scene = pd.Scene(low, top, pin, pd.Contact(friction=0.5, thickness=THICKNESS), gravity())
