@@ -371,7 +371,7 @@ DevicePlan<T> device_plan_view(at::TensorList arrays, const Place& place) {
   count.sum = plan.sums;
   count.piece = plan.pieces;
   const bool computed = plan.kernel == stream, fixed = computed && sizeof(T) == 4;
-  count.stored_block = computed ? 0 : plan.blocks;
+  count.stored_block = computed && plan.patches > 1 ? 0 : plan.blocks;
   count.rest_slot = computed && !fixed ? plan.slots : 0;
   count.fixed_slot = fixed ? plan.slots : 0;
   count.computed_block = computed ? plan.blocks : 0;

@@ -55,17 +55,17 @@ std::vector<std::int64_t> step_free(const StepCall<T>& call, const ContactCall<T
   std::vector<std::int64_t> list(call.batch), left;
   for (std::int64_t e = 0; e < call.batch; ++e) list[e] = e;
   std::vector<char> is_free(call.batch);
-  const auto make = [&] { return FreeMotion<T>(call, contact); };
-  each_environment(list, threads, make, [&](FreeMotion<T>& motion, std::int64_t e, const Team&) {
-    is_free[e] = motion.begins(e);
+  const auto make = [&] { return FreeLook<T>(call, contact); };
+  each_environment(list, threads, make, [&](FreeLook<T>& look, std::int64_t e, const Team&) {
+    is_free[e] = look.begins(e);
   });
   for (std::int64_t e = 0, end = 0; e < call.batch; e = end + 1) {
     for (end = e; end < call.batch && is_free[end];) ++end;
     if (end > e) step_any(part_of(call, e, end - e), threads);
   }
-  each_environment(list, threads, make, [&](FreeMotion<T>& motion, std::int64_t e, const Team&) {
-    is_free[e] = is_free[e] && motion.ends(e);
-    if (is_free[e]) motion.write(e);
+  each_environment(list, threads, make, [&](FreeLook<T>& look, std::int64_t e, const Team&) {
+    is_free[e] = is_free[e] && look.ends(e);
+    if (is_free[e]) look.write(e);
   });
   for (std::int64_t e : list)
     if (!is_free[e]) left.push_back(e);

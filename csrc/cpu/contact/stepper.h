@@ -180,13 +180,9 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
 
   // Poses, forces and numbers of the contact, for the caller. An overflow takes the step back.
   void write() {
-    const ContactPlan<T>& plan = contact_.plan;
-    const std::int64_t c = e_ * plan.colliders, m = e_ * plan.capacity;
-    const ContactHistory<T>& to = contact_.history;
-    double* const info = contact_.info + e_ * contact_info_count;
-    steps_.write(alone_, {to.next_poses + 7 * c, to.next_keys + m, to.next_forces + 4 * m,
-                          contact_.held_back + c, forces(), info});
-    info[contact_residual] = residual_;
+    const ContactOutput<T> to = contact_output(contact_, e_);
+    steps_.write(alone_, to);
+    to.info[contact_residual] = residual_;
     if (!steps_.overflows()) return;
     const std::int64_t count = 3 * std::int64_t(plan_.vertices);
     std::copy_n(call_.positions + e_ * count, count, call_.out_positions + e_ * count);

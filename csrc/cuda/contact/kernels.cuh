@@ -6,6 +6,7 @@
 #include "cuda/contact/launch.h"
 #include "cuda/contact/team.cuh"
 #include "cuda/rigid/contact_forces.h"
+#include "solver/contact/free.h"
 #include "solver/contact/step.h"
 #include "views/arena.h"
 
@@ -23,6 +24,7 @@ struct ContactMemory {
   double* partial;         // [batch, chunks, 2]
   int* counts;             // [batch, chunks]
   unsigned* counter;       // [batch]
+  unsigned char* is_free;  // [batch] whether the step without contact is the one with it
   int* component;          // [vertices]
   T* saved;                // [batch, vertices, 4]
 };
@@ -53,6 +55,7 @@ std::int64_t arrange(const ContactWork<T>& work, void* base, ContactMemory<T>& m
   arena.place(m.partial, 2 * chunks);
   arena.place(m.counts, chunks);
   arena.place(m.counter, work.batch);
+  arena.place(m.is_free, work.batch);
   arena.place(m.component, work.vertices);
   arena.place(m.saved, work.batch * work.vertices * 4);
   const std::int64_t shared = arena.size();
@@ -163,14 +166,42 @@ PD_DEVICE void correct(const ContactKernel<T>& call, const ContactSteps<T>& step
     cuts = steps.correct(team, forces);
 }
 
-// Positions and velocities of an environment whose pairs exceed the capacity stay.
+// Whether a task has something to do where the step without contact is the one with it.
+PD_HD constexpr bool knows_free(ContactTask task) {
+  return task == ContactTask::look_for_free || task == ContactTask::write;
+}
+
+// Writes a state in place of the one that the step leaves.
 template <class T>
-PD_DEVICE void take_back(const ContactWork<T>& w, const ContactTeam& team, std::int64_t e) {
+PD_DEVICE void write_state(const ContactWork<T>& w, const ContactTeam& team, std::int64_t e,
+                           const T* positions, const T* velocities) {
   const std::int64_t count = 3 * std::int64_t(w.vertices), first = e * count;
   team.spread(count, [&](int n) {
-    w.out_positions[first + n] = w.positions[first + n];
-    w.out_velocities[first + n] = w.velocities[first + n];
+    w.out_positions[first + n] = positions[first + n];
+    w.out_velocities[first + n] = velocities[first + n];
   });
+}
+
+template <class T>
+PD_DEVICE bool is_free(const ContactWork<T>& w, const FreeMotion<T>& motion,
+                       const ContactTeam& team, std::int64_t e) {
+  const ContactPlan<T>& plan = w.contact.plan;
+  const ContactHistory<T>& history = w.contact.history;
+  const std::int64_t at = 3 * e * w.vertices, pose = 7 * e * plan.colliders;
+  return motion.begins(team, history.keys + e * plan.capacity, w.positions + at,
+                       history.poses + pose) &&
+         motion.ends(team, w.positions + at, history.poses + pose, w.free_positions + at,
+                     w.contact.poses + pose);
+}
+
+template <class T>
+PD_DEVICE void write_free(const ContactWork<T>& w, const FreeMotion<T>& motion,
+                          const ContactTeam& team, std::int64_t e) {
+  motion.write(team, w.contact.poses + 7 * e * w.contact.plan.colliders,
+               contact_output(w.contact, e));
+  write_state(w, team, e, w.free_positions, w.free_velocities);
+  team.spread(w.out_info ? info_count : 0,
+              [&](int n) { w.out_info[e * info_count + n] = w.free_info[e * info_count + n]; });
 }
 
 template <ContactTask What, class T>
@@ -183,6 +214,9 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
   BlockTeam blocks(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
 #pragma unroll 1
   for (std::int64_t e = number; e < w.batch; e += call.teams) {
+    if (What == ContactTask::start && blocks.thread() == 0)
+      static_cast<Progress*>(w.progress)[e].done = call.memory.is_free[e] != 0;
+    if (!knows_free(What) && call.memory.is_free[e]) continue;
     __syncthreads();
     if (thread < contact_array_pointers)
       reinterpret_cast<char**>(&arrays)[thread] =
@@ -190,6 +224,19 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
     __syncthreads();
     const ContactTeam team(blocks, call.memory.partial + 2 * e * call.chunks,
                            call.memory.counts + e * call.chunks);
+    if constexpr (knows_free(What)) {
+      const FreeArrays<T> free{arrays.begin, arrays.place, arrays.body_box, &arrays.numbers->meets};
+      const FreeMotion<T> motion(plan, free);
+      if (What == ContactTask::look_for_free) {
+        const bool is = is_free(w, motion, team, e);
+        team.once([&] { call.memory.is_free[e] = is; });
+        continue;
+      }
+      if (call.memory.is_free[e]) {
+        write_free(w, motion, team, e);
+        continue;
+      }
+    }
     const ContactEnvironment<T> environment = environment_of(call, arrays, e);
     const ContactSteps<T> steps(environment);
     T* const forces = w.contact.forces + 3 * e * plan.vertices;
@@ -198,7 +245,6 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
       if (blocks.thread() == 0) {
         Progress& p = static_cast<Progress*>(w.progress)[e];
         p.used = 0;
-        p.done = false;
         p.stop = {
             squared_free_fall(w.vertices, w.settings.time_step, read3(w.material.gravity.of(e)))};
       }
@@ -215,11 +261,8 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
     } else if constexpr (What == ContactTask::finish) {
       steps.finish(team, forces);
     } else {
-      const std::int64_t c = e * plan.colliders, m = e * plan.capacity;
-      const ContactHistory<T>& to = w.contact.history;
-      steps.write(team, {to.next_poses + 7 * c, to.next_keys + m, to.next_forces + 4 * m,
-                         w.contact.held_back + c, forces, w.contact.info + e * contact_info_count});
-      if (steps.overflows()) take_back(w, team, e);
+      steps.write(team, contact_output(w.contact, e));
+      if (steps.overflows()) write_state(w, team, e, w.positions, w.velocities);
     }
     team.barrier();
   }
@@ -266,6 +309,7 @@ void prepare_contact(const ContactWork<T>& work, Stream to) {
   ContactKernel<T> call{work, {}, 0, 0, 0, 0, 0};
   arrange(work, work.memory, call.memory);
   check(cudaMemsetAsync(call.memory.component, 0xff, work.vertices * sizeof(int), stream));
+  check(cudaMemsetAsync(call.memory.is_free, 0, work.batch, stream));
   if (work.pieces == 0 || work.slots == 0) return;
   contact_components<T><<<blocks_of((work.slots + 255) / 256), 256, 0, stream>>>(call);
   check(cudaGetLastError());
@@ -286,6 +330,7 @@ void run_contact(ContactTask task, const ContactWork<T>& work, int k, int trial,
 #define X(name)           \
   case ContactTask::name: \
     return launch_contact<ContactTask::name>(work, k, trial, stream);
+    X(look_for_free)
     X(start)
     X(go_first)
     X(begin_correction)

@@ -12,6 +12,7 @@
 namespace pd {
 
 enum class ContactTask {
+  look_for_free,
   start,
   go_first,
   begin_correction,
@@ -32,6 +33,10 @@ struct ContactWork {
   const int *order = nullptr, *slot_vertex = nullptr, *slot_piece = nullptr;
   const T *positions = nullptr, *velocities = nullptr;  // of the caller
   T *out_positions = nullptr, *out_velocities = nullptr;
+  double* out_info = nullptr;  // [batch, info_count], or null
+  // of the step without contact, where it runs: the same arrays
+  T *free_positions = nullptr, *free_velocities = nullptr;
+  double* free_info = nullptr;
   // of the runner
   T *x = nullptr, *u = nullptr, *before = nullptr, *target = nullptr, *planes = nullptr,
     *spheres = nullptr;

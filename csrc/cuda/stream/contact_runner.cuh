@@ -29,6 +29,7 @@ ContactWork<T> contact_work(const StreamCall<T>& call, const ContactCall<T>& con
   work.velocities = step.velocities;
   work.out_positions = step.out_positions;
   work.out_velocities = step.out_velocities;
+  work.out_info = step.info;
   work.x = numbers(m.x);
   work.u = numbers(m.u);
   work.before = numbers(m.before);
@@ -44,12 +45,12 @@ ContactWork<T> contact_work(const StreamCall<T>& call, const ContactCall<T>& con
   return work;
 }
 
-// The same call without a tolerance: passes write the free iterate in place of the one before, and
-// environments that are done keep theirs.
+// The same call without a tolerance: passes write the free iterate in place of the one before. Tasks of contact stop.
 template <class T>
 StreamCall<T> without_tolerance(const StreamCall<T>& call) {
   StreamCall<T> own = call;
   own.step.settings.tolerance = 0;
+  own.stops = true;
   return own;
 }
 
@@ -65,6 +66,7 @@ class ContactRunner : public StreamRunner<T, HasContacts> {
 
   void rollout() {
     prepare_contact(work_, stream_);
+    if (work_.free_positions) run(ContactTask::look_for_free);
     this->template vertices<VertexTask::load>(0);
     this->assemble_diagonal();
     step(*this, this->set_);
@@ -138,10 +140,8 @@ void run_contact_with(const StreamCall<T>& call, const ContactWork<T>& work,
 }
 
 template <class T>
-void run_contact_with(const StreamCall<T>& call, const ContactCall<T>& contact,
-                      const Settings& settings, void* memory, const StencilWork<T>* stencils,
-                      cudaStream_t stream) {
-  const ContactWork<T> work = contact_work(call, contact, settings, memory);
+void run_contact_with(const StreamCall<T>& call, const ContactWork<T>& work,
+                      const StencilWork<T>* stencils, cudaStream_t stream) {
   if (has_contacts(call.step)) {
     run_contact_with<T, true>(call, work, stencils, stream);
   } else {
@@ -150,44 +150,103 @@ void run_contact_with(const StreamCall<T>& call, const ContactCall<T>& contact,
 }
 
 template <class T>
+std::int64_t block_bytes(const DeviceStep<T>& step) {
+  return fused_bytes(step);
+}
+template <class T>
+std::int64_t block_bytes(const MixedStep<T>& step) {
+  return mixed_block_bytes(step);
+}
+
+// A step with contact and its memory.
+//
+// The step without contact, which environments in which nothing comes near take, runs as kernel `block` for all of them
+// before contact does, where that kernel has room for a scene: then it takes a small share of the time. Its scratch is
+// where other arrays are later.
+template <class Step>
+struct ContactStep {
+  using T = typename Step::real;
+  StreamCall<T> call;
+  StencilWork<T> stencils;  // of a scene that has some
+  ContactWork<T> work;
+  Step free;  // the step without contact
+  bool tries_free;
+  void* scratch;
+  std::int64_t bytes;
+
+  // `place(arena)` places what passes need.
+  template <class Place>
+  ContactStep(const WithContact<Step>& given, void* memory, const Place& place)
+      : call{given.step, {}}, free(given.step) {
+    const DevicePlan<T>& plan = free.plan;
+    const Material<T>& material = free.material;
+    const std::size_t shared =
+        fused_shared_bytes(sizeof(T), false, plan.most_slots, plan.most_entries,
+                           material.planes_count, material.spheres_count);
+    tries_free = plan.patches == 1 && shared <= shared_memory_per_block();
+    free.plan.kernel = int(DeviceKernel::block);
+    Arena arena(memory);
+    if (tries_free) {
+      const std::int64_t numbers = 3 * free.batch * plan.vertices;
+      arena.place(free.out_positions, numbers);
+      arena.place(free.out_velocities, numbers);
+      if (free.info) arena.place(free.info, free.batch * info_count);
+    }
+    const std::int64_t begin = arena.size();
+    const auto at = [&](std::int64_t n) {
+      return memory ? static_cast<std::byte*>(memory) + n : nullptr;
+    };
+    scratch = at(begin);
+    place(arena, *this);
+    work = contact_work(call, given.contact, free.settings, at(arena.size()));
+    if (tries_free) {
+      work.free_positions = free.out_positions;
+      work.free_velocities = free.out_velocities;
+      work.free_info = free.info;
+    }
+    bytes =
+        std::max(arena.size() + contact_bytes(work), begin + (tries_free ? block_bytes(free) : 0));
+  }
+};
+
+template <class T>
+ContactStep<DeviceStep<T>> contact_step(const WithContact<DeviceStep<T>>& given, void* memory) {
+  return {given, memory,
+          [](Arena& arena, auto& own) { own.call.memory = arrange(arena, own.call); }};
+}
+template <class T>
+ContactStep<MixedStep<T>> contact_step(const WithContact<MixedStep<T>>& given, void* memory) {
+  const MixedStep<T> step = with_rows(given.step);
+  return {{step, given.contact}, memory, [&](Arena& arena, auto& own) {
+            own.stencils = arrange_mixed(arena, step, own.call);
+          }};
+}
+
+template <class T>
 std::int64_t contact_stream_bytes(const WithContact<DeviceStep<T>>& given) {
-  Arena arena(nullptr);
-  StreamCall<T> call{given.step, {}};
-  arrange(arena, call);
-  return arena.size() +
-         contact_bytes(contact_work(call, given.contact, given.step.settings, nullptr));
+  return contact_step(given, nullptr).bytes;
 }
 
 template <class T>
 void run_contact_stream(const WithContact<DeviceStep<T>>& given, void* memory, Stream to) {
-  StreamCall<T> call{given.step, {}};
-  Arena arena(memory);
-  call.memory = arrange(arena, call);
-  run_contact_with<T>(call, given.contact, given.step.settings,
-                      static_cast<std::byte*>(memory) + arena.size(), nullptr,
-                      static_cast<cudaStream_t>(to));
+  const auto own = contact_step(given, memory);
+  if (own.tries_free) run_fused(own.free, own.scratch, to);
+  run_contact_with<T>(own.call, own.work, nullptr, static_cast<cudaStream_t>(to));
 }
 
 template <class T>
 std::int64_t contact_mixed_bytes(const WithContact<MixedStep<T>>& given) {
-  const MixedStep<T> step = with_rows(given.step);
-  Arena arena(nullptr);
-  StreamCall<T> call{step, {}};
-  arrange_mixed(arena, step, call);
-  return arena.size() + contact_bytes(contact_work(call, given.contact, step.settings, nullptr));
+  return contact_step(given, nullptr).bytes;
 }
 
 template <class T>
 void run_contact_mixed(const WithContact<MixedStep<T>>& given, void* memory, Stream to) {
-  const MixedStep<T> step = with_rows(given.step);
+  const auto own = contact_step(given, memory);
+  if (own.tries_free) run_mixed_block(own.free, own.scratch, to);
   const auto stream = static_cast<cudaStream_t>(to);
-  StreamCall<T> call{step, {}};
-  Arena arena(memory);
-  const StencilWork<T> stencils = arrange_mixed(arena, step, call);
-  compute_stencil_numbers(stencils, step.effects, step.batch, stream);
-  compute_row_numbers(stencils, step.batch, stream);
-  run_contact_with<T>(call, given.contact, step.settings,
-                      static_cast<std::byte*>(memory) + arena.size(), &stencils, stream);
+  compute_stencil_numbers(own.stencils, own.free.effects, own.free.batch, stream);
+  compute_row_numbers(own.stencils, own.free.batch, stream);
+  run_contact_with<T>(own.call, own.work, &own.stencils, stream);
 }
 
 }  // namespace pd::inline PD_TARGET

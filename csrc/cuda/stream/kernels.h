@@ -41,6 +41,7 @@ template <class T>
 struct StreamCall {
   DeviceStep<T> step;
   StreamMemory<T> memory;
+  bool stops = step.settings.tolerance > 0;  // whether passes skip environments that are done
 
   PD_HD int shared_blocks() const {
     return (step.plan.shared + shared_threads - 1) / shared_threads;
@@ -214,7 +215,7 @@ PD_DEVICE bool wants_sums(const StreamWork<T, HasContacts>& w) {
 template <Visit What, class T, bool HasContacts>
 PD_DEVICE bool skips(const StreamWork<T, HasContacts>& w) {
   constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
-  return updates && w.settings().tolerance > 0 && w.progress.done;
+  return updates && w.call.stops && w.progress.done;
 }
 
 // The elements of a pass besides tetrahedra.

@@ -54,7 +54,7 @@ class Pipeline {
     const bool updates = updater() < updater_threads, loads = !updates && loader() < loader_threads;
     if (threadIdx.x == 0) init_signals();
     if (loads) {
-      if (call_.step.settings.tolerance > 0) wait_for_previous_kernel();
+      if (call_.stops) wait_for_previous_kernel();
       if (loader() == 0) schedule_cursor() = {int(blockIdx.x), 0};
       if (loader() < warp_size) extend_schedule(0);
     }

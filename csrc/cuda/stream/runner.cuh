@@ -193,9 +193,9 @@ class StreamRunner {
   template <Visit What, bool Projects = HasContacts>
   void pass(int k) {
     // Messages of each pipeline pass carry a new number. The first pass of a call writes 0 to every
-    // place, so no old message matches. With a tolerance the number is 0 too, and stream_shared
-    // waits for the whole pass, since converged environments send nothing.
-    const unsigned round = set_.tolerance > 0 ? 0 : ++round_;
+    // place, so no old message matches. Where environments stop the number is 0 too, and stream_shared
+    // waits for the whole pass, since those that are done send nothing.
+    const unsigned round = call_.stops ? 0 : ++round_;
     const bool piped = !stencils_ && pipe<What, Projects>(k, round);
     if (!piped && !run_mixed<What, Projects>(k))
       launcher_.run(stream_patches<What, T, Projects>, patches_, pass_threads, pass_shared_, call_,

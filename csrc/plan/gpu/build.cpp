@@ -27,7 +27,7 @@ constexpr int most_children = 32;  // rows of a sum over a piece
 
 // Computes the offsets of each patch's arrays.
 void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches, int members,
-                    bool stored, bool fixed) {
+                    bool computed, bool fixed) {
   plan.patch_block = plan.patch_slot = {0};
   for (const MeshPatch& patch : patches) {
     plan.patch_pairs.push_back(std::int32_t(patch.pairs.size()));
@@ -44,12 +44,12 @@ void number_patches(DeviceMeshPlan& plan, const std::vector<MeshPatch>& patches,
   plan.pair_tet.resize(blocks * 2 * lanes);
   plan.pair_bound.resize(blocks * 2 * lanes);
   if (members == 4) plan.pair_coupled.resize(blocks * lanes);
-  if (stored) plan.pair_rest.resize(blocks * pair_rest_numbers * lanes);
-  if (!stored && !fixed) plan.slot_rest.resize(slots * 4);
+  if (!computed || patches.size() == 1) plan.pair_rest.resize(blocks * pair_rest_numbers * lanes);
+  if (computed && !fixed) plan.slot_rest.resize(slots * 4);
   plan.pair_corner.resize(blocks * 5 * lanes);
   plan.slot_vertex.resize(slots);
   plan.slot_row.resize(slots);
-  if (stored) return;
+  if (!computed) return;
   plan.pair_factor.resize(blocks * 2 * lanes);
   plan.patch_unit.assign(patches.size(), 1.0);
   if (fixed) plan.slot_fixed.resize(slots * 4);
@@ -361,7 +361,7 @@ DeviceMeshPlan build_device_plan(const MeshElements& elements, int patches, int 
   progress(0.7);
 
   DeviceMeshPlan plan;
-  number_patches(plan, made, elements.averaged.members, kernel != stream_kernel, fixed);
+  number_patches(plan, made, elements.averaged.members, kernel == stream_kernel, fixed);
   number_stencils(plan, elements, made);
   number_rows(plan, elements, made);
   renumber(mesh.numbering, made);

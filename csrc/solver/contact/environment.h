@@ -273,6 +273,34 @@ struct BodyState {
   }
 };
 
+// Poses, forces and numbers of the contact of an environment, for the caller.
+template <class T>
+struct ContactOutput {
+  T* poses;
+  std::int64_t* keys;
+  T *forces, *held_back, *vertex_forces;
+  double* info;
+
+  PD_HD void write_force(int at, std::int64_t key, const Multiplier<T>& of) const {
+    keys[at] = key;
+    T* const f = forces + 4 * std::int64_t(at);
+    f[0] = of.normal, f[1] = of.tangential.x, f[2] = of.tangential.y, f[3] = of.tangential.z;
+  }
+};
+
+template <class T>
+PD_HD ContactOutput<T> contact_output(const ContactCall<T>& contact, std::int64_t e) {
+  const ContactPlan<T>& plan = contact.plan;
+  const ContactHistory<T>& history = contact.history;
+  const std::int64_t c = e * plan.colliders, m = e * plan.capacity;
+  return {history.next_poses + 7 * c,
+          history.next_keys + m,
+          history.next_forces + 4 * m,
+          contact.held_back + c,
+          contact.forces + 3 * e * plan.vertices,
+          contact.info + e * contact_info_count};
+}
+
 // What a team works on.
 template <class T>
 struct ContactEnvironment {

@@ -225,16 +225,9 @@ class ContactSteps {
     });
   }
 
-  // Poses, forces and numbers of the contact, for the caller. An overflow takes the step back: then
-  // nothing has changed, and no force acts. `next`: the history of this environment.
-  struct Output {
-    T* poses;
-    std::int64_t* keys;
-    T *forces, *held_back, *vertex_forces;
-    double* info;
-  };
+  // An overflow takes the step back: then nothing has changed, and no force acts.
   template <class Team>
-  PD_HD void write(const Team& team, const Output& to) const {
+  PD_HD void write(const Team& team, const ContactOutput<T>& to) const {
     const ContactNumbers& numbers = env_.numbers();
     const bool overflows = this->overflows();
     const int pairs = overflows ? 0 : numbers.pairs;
@@ -244,15 +237,14 @@ class ContactSteps {
     team.spread(pairs, [&](int p) {
       const int at = a_.entry[p];
       if (a_.entry[p + 1] == at) return;
-      const Multiplier<T>& of = a_.pair[p].force;
-      write_force(to, at, a_.pair[p].key, of.normal, of.tangential);
+      to.write_force(at, a_.pair[p].key, a_.pair[p].force);
     });
     team.spread(plan_.capacity, [&](int n) {
       const T* f = env_.history_force + 4 * std::int64_t(n);
       if (overflows) {
-        write_force(to, n, env_.history_key[n], f[0], {f[1], f[2], f[3]});
+        to.write_force(n, env_.history_key[n], {f[0], {f[1], f[2], f[3]}});
       } else if (n >= count) {
-        write_force(to, n, -1, T(0), {T(0), T(0), T(0)});
+        to.write_force(n, -1, {});
       }
     });
     if (overflows) team.spread(3 * plan_.vertices, [&](int n) { to.vertex_forces[n] = T(0); });
@@ -274,13 +266,6 @@ class ContactSteps {
   }
 
  private:
-  PD_HD static void write_force(const Output& to, int at, std::int64_t key, T normal,
-                                const Vec3<T>& tangential) {
-    to.keys[at] = key;
-    T* const f = to.forces + 4 * std::int64_t(at);
-    f[0] = normal, f[1] = tangential.x, f[2] = tangential.y, f[3] = tangential.z;
-  }
-
   // Takes back the coarse correction of components with a vertex of each_touching(touch).
   template <class Team, class Each>
   PD_HD void restore_touching(const Team& team, const Each& each_touching) const {
