@@ -133,10 +133,10 @@ def test_bodies_that_meet_keep_their_momentum(iterations: int, dtype: torch.dtyp
 
 @pytest.mark.parametrize("batch", [1, 300])
 def test_bits_without_contact(batch: int, dtype: torch.dtype) -> None:
-    """Steps in which nothing meets are those of kernel `stream` without Contact."""
+    """Steps in which nothing meets are those of kernel `block` without Contact."""
     bodies = block(0.1, 2, (0.0, 0.0, 0.0)), block(0.1, 2, (0.3, 0.0, 0.0))
     met = simulator(pd.Scene(*bodies, pd.Gravity(), pd.Contact(thickness=THICKNESS)), 24, dtype=dtype, device=GPU)
-    alone = simulator(pd.Scene(*bodies, pd.Gravity()), 24, dtype=dtype, device=GPU, kernel="stream")
+    alone = simulator(pd.Scene(*bodies, pd.Gravity()), 24, dtype=dtype, device=GPU, kernel="block")
     state: Any = met.rest_state(batch)
     state.velocities.add_(noise(state.velocities))
     plain = pd.State(state.positions.clone(), state.velocities.clone())

@@ -70,6 +70,8 @@ struct ContactPair {
   PD_HD Vec3<T> normal_at(const Closest<T>& at) const {
     return at.distance > T(1e-9) ? (T(1) / at.distance) * at.diff : plane.normal;
   }
+  // Takes them as those of the present iterate.
+  PD_HD void look(const Closest<T>& at) { near = at, normal = normal_at(at); }
 
   // between two places, along the surface
   template <class Places>

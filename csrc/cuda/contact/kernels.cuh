@@ -19,14 +19,15 @@ constexpr int most_items_of_block = 4096;
 
 template <class T>
 struct ContactMemory {
-  ContactArrays<T> first;  // of the first environment
-  std::int64_t stride;     // bytes between environments
-  double* partial;         // [batch, chunks, 2]
-  int* counts;             // [batch, chunks]
-  unsigned* counter;       // [batch]
-  unsigned char* is_free;  // [batch] whether the step without contact is the one with it
-  int* component;          // [vertices]
-  T* saved;                // [batch, vertices, 4]
+  ContactArrays<T> first;     // of the first environment
+  std::int64_t stride;        // bytes between environments
+  double* partial;            // [batch, chunks, 2]
+  int* counts;                // [batch, chunks]
+  unsigned* counter;          // [batch]
+  unsigned char* is_free;     // [batch] whether the step without contact is the one with it
+  unsigned char* is_correct;  // [batch] whether no coarse correction is asked for
+  int* component;             // [vertices]
+  T* saved;                   // [batch, vertices, 4]
 };
 
 template <class T>
@@ -35,6 +36,32 @@ struct ContactKernel {
   ContactMemory<T> memory;
   int chunks, teams, blocks, k, trial;
 };
+
+// Rows of active pairs, and what they move, in shared memory: for an iteration by one block.
+template <class T>
+struct SharedRows {
+  static constexpr int pairs = 320, vertices = 256;
+  alignas(16) Four<T> moved_by[vertices];
+  T weight[vertices];
+  int row_of[pairs];
+  alignas(16) T rows[ActiveRows<T>::size(pairs)];
+
+  // Whether it has room; if not, they stay where they are.
+  PD_DEVICE static bool fits(const ContactPlan<T>& plan, const ContactArrays<T>& arrays) {
+    return plan.vertices <= vertices && arrays.numbers->pairs <= pairs;
+  }
+  PD_DEVICE void lend(ContactArrays<T>& arrays) {
+    arrays.moved_by = moved_by, arrays.weight = weight;
+    arrays.row_of = row_of, arrays.rows = rows;
+  }
+};
+
+// Dynamic shared memory: of walks, and before them in an iteration of SharedRows.
+template <class T>
+std::size_t shared_bytes_of(ContactTask task) {
+  return task == ContactTask::iterate ? std::max(sizeof(SharedRows<T>), bench_bytes<T>)
+                                      : bench_bytes<T>;
+}
 
 template <class T>
 int count_chunks(const ContactWork<T>& work) {
@@ -56,6 +83,7 @@ std::int64_t arrange(const ContactWork<T>& work, void* base, ContactMemory<T>& m
   arena.place(m.counts, chunks);
   arena.place(m.counter, work.batch);
   arena.place(m.is_free, work.batch);
+  arena.place(m.is_correct, work.batch);
   arena.place(m.component, work.vertices);
   arena.place(m.saved, work.batch * work.vertices * 4);
   const std::int64_t shared = arena.size();
@@ -87,7 +115,8 @@ PD_DEVICE BodyState<T> body_state(const ContactKernel<T>& call, std::int64_t e) 
 
 template <class T>
 PD_DEVICE ContactEnvironment<T> environment_of(const ContactKernel<T>& call,
-                                               const ContactArrays<T>& arrays, std::int64_t e) {
+                                               const ContactArrays<T>& arrays, int most_rows,
+                                               std::int64_t e) {
   const ContactWork<T>& w = call.work;
   const ContactPlan<T>& plan = w.contact.plan;
   const int planes = w.material.planes_count, spheres = w.material.spheres_count;
@@ -99,7 +128,8 @@ PD_DEVICE ContactEnvironment<T> environment_of(const ContactKernel<T>& call,
           w.contact.history.poses + e * plan.colliders * 7,
           w.contact.poses + e * plan.colliders * 7,
           w.contact.history.keys + e * plan.capacity,
-          w.contact.history.forces + 4 * e * plan.capacity};
+          w.contact.history.forces + 4 * e * plan.capacity,
+          most_rows};
 }
 
 template <class T>
@@ -145,11 +175,13 @@ PD_DEVICE bool asks_correction(const ContactKernel<T>& call, const ContactNumber
 template <class T>
 PD_DEVICE void begin_correction(const ContactKernel<T>& call, const ContactSteps<T>& steps,
                                 const ContactTeam& team, ContactNumbers& numbers, std::int64_t e) {
+  bool corrects = false;
   if (asks_correction(call, numbers, e)) {
-    steps.begin_correction(team);
+    corrects = steps.begin_correction(team);
   } else {
     team.once([&] { numbers.corrects = 0; });
   }
+  team.spread(1, [&](int) { call.memory.is_correct[e] = !corrects; });
 }
 
 template <class T>
@@ -214,8 +246,10 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
   BlockTeam blocks(int(blockIdx.x) % call.blocks, call.blocks, call.memory.counter + number);
 #pragma unroll 1
   for (std::int64_t e = number; e < w.batch; e += call.teams) {
-    if (What == ContactTask::start && blocks.thread() == 0)
+    if (What == ContactTask::start && blocks.thread() == 0) {
       static_cast<Progress*>(w.progress)[e].done = call.memory.is_free[e] != 0;
+      call.memory.is_correct[e] = 1;
+    }
     if (!knows_free(What) && call.memory.is_free[e]) continue;
     __syncthreads();
     if (thread < contact_array_pointers)
@@ -237,7 +271,14 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
         continue;
       }
     }
-    const ContactEnvironment<T> environment = environment_of(call, arrays, e);
+    int most_rows = plan.capacity;
+    if (What == ContactTask::iterate && call.blocks == 1 && SharedRows<T>::fits(plan, arrays)) {
+      most_rows = SharedRows<T>::pairs;
+      __syncthreads();  // all have read
+      if (thread == 0) reinterpret_cast<SharedRows<T>*>(contact_shared())->lend(arrays);
+      __syncthreads();
+    }
+    const ContactEnvironment<T> environment = environment_of(call, arrays, most_rows, e);
     const ContactSteps<T> steps(environment);
     T* const forces = w.contact.forces + 3 * e * plan.vertices;
     if constexpr (What == ContactTask::start) {
@@ -280,7 +321,8 @@ void launch_contact(const ContactWork<T>& work, int k, int trial, cudaStream_t s
   ContactKernel<T> call{work, {}, count_chunks(work), 0, 0, k, trial};
   arrange(work, work.memory, call.memory);
   const auto* kernel = reinterpret_cast<const void*>(contact_task<What, T>);
-  const int resident = resident_blocks(kernel, contact_threads, 0);
+  const std::size_t shared = shared_bytes_of<T>(What);
+  const int resident = resident_blocks(kernel, contact_threads, shared);
   const ContactPlan<T>& plan = work.contact.plan;
   const std::int64_t items = std::max<std::int64_t>(plan.vertices, std::int64_t(plan.edges));
   const Teams teams(work.batch, resident,
@@ -288,8 +330,8 @@ void launch_contact(const ContactWork<T>& work, int k, int trial, cudaStream_t s
   call.teams = teams.blocks > 1 ? teams.count : int(blocks_of(work.batch));
   call.blocks = teams.blocks;
   if (call.blocks > 1)
-    return launch_teams(kernel, call, call.memory.counter, contact_threads, 0, stream);
-  contact_task<What, T><<<unsigned(call.teams), contact_threads, 0, stream>>>(call);
+    return launch_teams(kernel, call, call.memory.counter, contact_threads, shared, stream);
+  contact_task<What, T><<<unsigned(call.teams), contact_threads, shared, stream>>>(call);
   check(cudaGetLastError());
 }
 
@@ -313,6 +355,13 @@ void prepare_contact(const ContactWork<T>& work, Stream to) {
   if (work.pieces == 0 || work.slots == 0) return;
   contact_components<T><<<blocks_of((work.slots + 255) / 256), 256, 0, stream>>>(call);
   check(cudaGetLastError());
+}
+
+template <class T>
+ContactFlags contact_flags(const ContactWork<T>& work) {
+  ContactMemory<T> memory;
+  arrange(work, work.memory, memory);
+  return {memory.is_free, memory.is_correct};
 }
 
 template <class T>

@@ -56,6 +56,13 @@ std::int64_t contact_bytes(const ContactWork<T>& work);
 template <class T>
 void prepare_contact(const ContactWork<T>& work, Stream stream);
 
+// [batch] Environments that no task but the last changes, and those that ask for no coarse correction.
+struct ContactFlags {
+  const unsigned char *is_free, *is_correct;
+};
+template <class T>
+ContactFlags contact_flags(const ContactWork<T>& work);
+
 // `k`: iteration; `trial`: of its coarse correction
 template <class T>
 void run_contact(ContactTask task, const ContactWork<T>& work, int k, int trial, Stream stream);

@@ -51,6 +51,22 @@ struct SingleLane {
   PD_DEVICE static bool all(bool holds) { return holds; }
 };
 
+// What a warp keeps in shared memory: sides of a cluster that meet the hull of another one.
+template <class T>
+struct WalkBench {
+  Four<T> low[warp_size], high[warp_size];
+  int corner[3][warp_size], number[warp_size];
+  SidePair queue[2 * warp_size];
+};
+template <class T>
+constexpr std::size_t bench_bytes = sizeof(WalkBench<T>) * (contact_threads / warp_size);
+
+// The dynamic shared memory of a task.
+PD_DEVICE std::byte* contact_shared() {
+  extern __shared__ __align__(16) std::byte shared[];
+  return shared;
+}
+
 class ContactTeam {
  public:
   static constexpr bool in_order = false;
@@ -200,8 +216,16 @@ class ContactTeam {
   }
   template <int Count, class Add>
   PD_DEVICE void sum_range(int begin, int end, const Add& add, double (&sums)[Count]) const {
+    add_range(begin, end, [&](int i) { add(i, sums); });
+    block_sum(sums);
+  }
+  template <class Add>
+  PD_DEVICE void add_range(int begin, int end, const Add& add) const {
 #pragma unroll 1
-    for (int i = begin + int(threadIdx.x); i < end; i += contact_threads) add(i, sums);
+    for (int i = begin + int(threadIdx.x); i < end; i += contact_threads) add(i);
+  }
+  template <int Count>
+  PD_DEVICE void add_up(double (&sums)[Count]) const {
     block_sum(sums);
   }
   template <int Count, class Take>
@@ -225,6 +249,29 @@ class ContactTeam {
     __syncthreads();
   }
   PD_DEVICE bool leads() const { return threadIdx.x == 0; }
+  template <class Task>
+  PD_DEVICE void lead(const Task& task) const {
+    if (leads()) task();
+    __syncthreads();
+  }
+  template <class Item>
+  PD_DEVICE void spread_of_group(int count, const Item& item) const {
+#pragma unroll 1
+    for (int i = int(threadIdx.x); i < count; i += contact_threads) item(i);
+  }
+  template <class Item>
+  PD_DEVICE void each_of_group(int count, const Item& item) const {
+    spread_of_group(count, item);
+    __syncthreads();
+  }
+  template <class Item>
+  PD_DEVICE void each_below(int begin, int end, const Item& item) const {
+    const int side = end - begin;
+    each_of_group(side * side, [&](int at) {
+      const int row = at % side, column = at / side;
+      if (row >= column) item(begin + row, begin + column);
+    });
+  }
 
  private:
   // What a lane found.
@@ -248,18 +295,12 @@ class ContactTeam {
     return closest_points(pair.edges, corner);
   }
 
-  // What a warp keeps in shared memory: sides of a cluster that meet the hull of another one.
   template <class T>
-  struct Bench {
-    Four<T> low[warp_size], high[warp_size];
-    int corner[3][warp_size], number[warp_size];
-    SidePair queue[2 * warp_size];
-  };
+  using Bench = WalkBench<T>;
   // One for all walks of a kernel.
   template <class T>
   PD_DEVICE static Bench<T>& bench_of_warp() {
-    __shared__ Bench<T> benches[contact_threads / warp_size];
-    return benches[threadIdx.x / warp_size];
+    return reinterpret_cast<Bench<T>*>(contact_shared())[threadIdx.x / warp_size];
   }
 
   // Bits of the sides on the bench whose boxes meet that of the lane, and that share no vertex.

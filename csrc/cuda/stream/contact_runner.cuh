@@ -62,7 +62,12 @@ class ContactRunner : public StreamRunner<T, HasContacts> {
  public:
   ContactRunner(const StreamCall<T>& call, const ContactWork<T>& work,
                 const StencilWork<T>* stencils, cudaStream_t stream)
-      : Base(without_tolerance(call), nullptr, stencils, stream), work_(work), stream_(stream) {}
+      : Base(without_tolerance(call), nullptr, stencils, stream),
+        work_(work),
+        flags_(contact_flags(work)),
+        stream_(stream) {
+    this->call_.skipped = flags_.is_free;
+  }
 
   void rollout() {
     prepare_contact(work_, stream_);
@@ -114,12 +119,17 @@ class ContactRunner : public StreamRunner<T, HasContacts> {
     if (work_.pieces == 0) return;
     for (int trial = 0; trial < (HasContacts ? coarse_trials : 1); ++trial) {
       run(ContactTask::begin_correction, k, trial);
-      if (HasContacts) this->template pass<Visit::keep_forces>(int(Iterate::last));
+      if (HasContacts) {
+        this->call_.skipped = flags_.is_correct;
+        this->template pass<Visit::keep_forces>(int(Iterate::last));
+        this->call_.skipped = flags_.is_free;
+      }
       run(ContactTask::correct, k, trial);
     }
   }
 
   ContactWork<T> work_;
+  ContactFlags flags_;
   cudaStream_t stream_;
   bool begun_ = false;
 };

@@ -41,7 +41,8 @@ template <class T>
 struct StreamCall {
   DeviceStep<T> step;
   StreamMemory<T> memory;
-  bool stops = step.settings.tolerance > 0;  // whether passes skip environments that are done
+  bool stops = step.settings.tolerance > 0;  // whether updates skip environments that are done
+  const unsigned char* skipped = nullptr;    // [batch] environments that other passes skip
 
   PD_HD int shared_blocks() const {
     return (step.plan.shared + shared_threads - 1) / shared_threads;
@@ -214,8 +215,9 @@ PD_DEVICE bool wants_sums(const StreamWork<T, HasContacts>& w) {
 
 template <Visit What, class T, bool HasContacts>
 PD_DEVICE bool skips(const StreamWork<T, HasContacts>& w) {
-  constexpr bool updates = What == Visit::update || What == Visit::update_guarded;
-  return updates && w.call.stops && w.progress.done;
+  if constexpr (What == Visit::update || What == Visit::update_guarded)
+    return w.call.stops && w.progress.done;
+  return w.call.skipped && w.call.skipped[w.environment];
 }
 
 // The elements of a pass besides tetrahedra.

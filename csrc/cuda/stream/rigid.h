@@ -90,6 +90,7 @@ __global__ void __launch_bounds__(rounds_threads)
   const int number = int(blockIdx.x) / call.blocks;
   BlockTeam team(int(blockIdx.x) % call.blocks, call.blocks, call.counter + number);
   for (std::int64_t e = number; e < call.stream.step.batch; e += call.teams) {
+    if (call.stream.skipped && call.stream.skipped[e]) continue;
     const StreamWork<T, HasContacts> w(call.stream, e);
     StreamRounds<T, HasContacts>(w, call.from, team).run();
   }

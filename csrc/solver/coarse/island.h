@@ -178,29 +178,22 @@ class CoarseIsland {
     }
   }
 
-  // `sums`: ContactSums of all bodies, by their numbers. Couples are set.
-  PD_CALLED void pass(const double* sums) {
-    using S = ContactSums;
-    done_ = ++passes_ > most_island_passes;
-    if (done_) return;
-    double scale = 0, own_before = 0, own_after = 0, before = 0, after = 0, lag = 0, radius = 0;
-    for (int n = 0; n < count_; ++n) {
-      const CoarseBody& of = body(n);
-      double sum[S::count];
-      for (int i = 0; i < S::count; ++i) sum[i] = sums[member_[n] * S::count + i];
-      own_before += of.energy(of.accepted_);
-      own_after += of.energy(of.trial_);
-      before += sum[S::before], after += sum[S::after];
-      lag += sum[S::lag], radius += sum[S::radius];
-      scale += of.body_.weight * of.body_.square;
-      add_body(n, sum);
-    }
-    const double rounding = energy_rounding * (scale + before);
-    const bool falls = own_after + after <= own_before + before + rounding;
-    if (share_ > 0 && !ends_step(falls)) return try_step();
-    for (int n = 0; n < count_; ++n) body(n).accepted_ = body(n).trial_;
-    moved_ += share_ * length_of_step();
-    decide(lag, radius);
+  // `sums`: ContactSums of all bodies, by their numbers. Couples are set. A group of threads shares what grows with the
+  // number of bodies; one takes the rest.
+  template <class Group>
+  PD_CALLED void pass(const Group& group, const double* sums) {
+    const int count = count_;
+    group.each_of_group(count, [&](int n) { add_body(n, sums + member_[n] * ContactSums::count); });
+    // blocks of couples by twists in lengths that pins leave
+    for (int n = 0; n < count; ++n)
+      group.each_of_group(6 * count, [&](int line) { keep_couple(n, line / 6, line % 6); });
+    group.lead([&] {
+      done_ = ++passes_ > most_island_passes;
+      solves_ = !done_ && weigh(sums);
+    });
+    if (!solves_) return;
+    solve(group);
+    group.lead([&] { decide(); });
   }
 
   // Whether no body turns by more than a right angle: where one does, other pairs would hold it.
@@ -221,27 +214,52 @@ class CoarseIsland {
     return matrix_[std::int64_t(column) * rows() + row];
   }
 
-  PD_HD void add_body(int n, const double (&sum)[ContactSums::count]) {
-    const CoarseBody& of = body(n);
-    double terms[CoarseBody::terms_count];
-    of.find_terms(sum, terms);
+  PD_HD void add_body(int n, const double* sums) {
+    double sum[ContactSums::count], terms[CoarseBody::terms_count];
+    for (int i = 0; i < ContactSums::count; ++i) sum[i] = sums[i];
+    body(n).find_terms(sum, terms);
     for (int r = 0; r < 6; ++r) {
       for (int c = 0; c <= r; ++c) entry(6 * n + r, 6 * n + c) = terms[CoarseBody::at(r, c)];
       right_[6 * n + r] = terms[CoarseBody::at(6, r)];
     }
-    // blocks of couples by twists in lengths that pins leave
-    for (int m = 0; m < count_; ++m) {
-      if (m == n) continue;
-      for (int k = 0; k < 6; ++k) {
-        double line[6];
-        const auto at = [&](int i) -> double& {
-          return m < n ? entry(6 * n + i, 6 * m + k) : entry(6 * m + k, 6 * n + i);
-        };
-        for (int i = 0; i < 6; ++i) line[i] = at(i);
-        of.keep_twist(line);
-        for (int i = 0; i < 6; ++i) at(i) = line[i];
-      }
+  }
+
+  // A line of the block of members n and m, by the twist of n.
+  PD_HD void keep_couple(int n, int m, int k) {
+    if (m == n) return;
+    double line[6];
+    const auto at = [&](int i) -> double& {
+      return m < n ? entry(6 * n + i, 6 * m + k) : entry(6 * m + k, 6 * n + i);
+    };
+    for (int i = 0; i < 6; ++i) line[i] = at(i);
+    body(n).keep_twist(line);
+    for (int i = 0; i < 6; ++i) at(i) = line[i];
+  }
+
+  // Judges the trial. Whether it is accepted, and the next step must be found.
+  PD_HD bool weigh(const double* sums) {
+    using S = ContactSums;
+    double scale = 0, own_before = 0, own_after = 0, before = 0, after = 0;
+    lag_ = radius_ = 0;
+    for (int n = 0; n < count_; ++n) {
+      const CoarseBody& of = body(n);
+      const double* const sum = sums + member_[n] * S::count;
+      own_before += of.energy(of.accepted_);
+      own_after += of.energy(of.trial_);
+      before += sum[S::before], after += sum[S::after];
+      lag_ += sum[S::lag], radius_ += sum[S::radius];
+      scale += of.body_.weight * of.body_.square;
     }
+    const double rounding = energy_rounding * (scale + before);
+    const bool falls = own_after + after <= own_before + before + rounding;
+    if (share_ > 0 && !ends_step(falls)) {
+      try_step();
+      return false;
+    }
+    for (int n = 0; n < count_; ++n) body(n).accepted_ = body(n).trial_;
+    moved_ += share_ * length_of_step();
+    for (int i = 0; i < rows(); ++i) way_[i] = right_[i];
+    return true;
   }
 
   // Whether the trial is good enough; else how much of the step to try next.
@@ -263,21 +281,19 @@ class CoarseIsland {
     return false;
   }
 
-  // From the terms at the accepted motions: Newton's step, or radii are renewed. A small step is the last.
-  PD_HD void decide(double lag, double radius) {
-    for (int i = 0; i < rows(); ++i) way_[i] = right_[i];
-    solve();
+  // Newton's step from the accepted motions, or radii are renewed. A small step is the last.
+  PD_HD void decide() {
     slope_ = 0;
     for (int i = 0; i < rows(); ++i) {
       body(i / 6).step_[i % 6] = right_[i];
       slope_ += way_[i] * right_[i];
     }
     const double length = length_of_step();
-    const bool behind = lag > lag_share * lag_share * radius;
+    const bool behind = lag_ > lag_share * lag_share * radius_;
     share_ = 1;
     renews_ = 0;
     if (behind && (length <= still_share || length <= settled_share * moved_)) {
-      renews_ = lag <= settled_share * settled_share * radius ? 1.0 : 0.5;
+      renews_ = lag_ <= settled_share * settled_share * radius_ ? 1.0 : 0.5;
       share_ = moved_ = 0;  // a pass at the accepted motions
     }
     try_step();
@@ -305,24 +321,25 @@ class CoarseIsland {
   }
 
   // right = x with A x = right for an A that is not negative, 0 along rows without pivot: A = L D L^T. The matrix is lost.
-  PD_HD void solve() {
+  template <class Group>
+  PD_HD void solve(const Group& group) {
     const int n = rows();
-    double most = 0;
-    for (int i = 0; i < n; ++i) most = entry(i, i) > most ? entry(i, i) : most;
+    group.lead([&] {
+      most_ = 0;
+      for (int i = 0; i < n; ++i) most_ = entry(i, i) > most_ ? entry(i, i) : most_;
+    });
     for (int j = 0; j < n; ++j) {
-      const double pivot = entry(j, j);
-      inverse_[j] = pivot > no_pivot * most ? 1.0 / pivot : 0.0;
-      for (int c = j + 1; c < n; ++c) {
-        const double factor = inverse_[j] * entry(c, j);
-        if (factor == 0) continue;
-        for (int r = c; r < n; ++r) entry(r, c) -= factor * entry(r, j);
-        right_[c] -= factor * right_[j];
-      }
+      const double pivot = entry(j, j), inverse = pivot > no_pivot * most_ ? 1.0 / pivot : 0.0;
+      group.spread_of_group(n - j - 1, [&](int at) {
+        right_[j + 1 + at] -= inverse * entry(j + 1 + at, j) * right_[j];
+      });
+      group.each_below(j + 1, n,
+                       [&](int r, int c) { entry(r, c) -= inverse * entry(c, j) * entry(r, j); });
+      if (group.leads()) inverse_[j] = inverse;
     }
     for (int j = n - 1; j >= 0; --j) {
-      double sum = right_[j];
-      for (int r = j + 1; r < n; ++r) sum -= entry(r, j) * right_[r];
-      right_[j] = inverse_[j] * sum;
+      group.lead([&] { right_[j] *= inverse_[j]; });
+      group.each_of_group(j, [&](int i) { right_[i] -= entry(j, i) * right_[j]; });
     }
   }
 
@@ -331,7 +348,8 @@ class CoarseIsland {
   int count_ = 0, passes_ = 0;
   double *matrix_ = nullptr, *right_ = nullptr, *way_ = nullptr, *inverse_ = nullptr;
   double share_ = 0, slope_ = 0, moved_ = 0, renews_ = 0;
-  bool done_ = true;
+  double lag_ = 0, radius_ = 0, most_ = 0;  // of a pass
+  bool done_ = true, solves_ = false;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -77,7 +77,7 @@ class ContactCorrection {
   template <class Team>
   PD_HD void shift_targets(const Team& team) const {
     const int pairs = env_.numbers().pairs;
-    team.each(pairs, [&](int p) { env_.keep_pushes(p, true), a_.active[p] = 1; });
+    team.each(pairs, [&](int p) { env_.keep_pushes(p); });
     team.each(body_.vertices, [&](int i) {
       const Vec3<T> target = BodyState<T>::read(body_.target, i);
       BodyState<T>::write(body_.saved, i, target);
@@ -295,9 +295,9 @@ class ContactCorrection {
           sum_couple(row, column, group);
       });
       team.groups(count, [&](int g, const auto& group) {
-        if (a_.size[g] == 0 || a_.island[g].is_done() || !group.leads()) return;
-        a_.island[g].pass(a_.coarse_sum);
-        if (!a_.island[g].is_done()) numbers.searching = 1;
+        if (a_.size[g] == 0 || a_.island[g].is_done()) return;
+        a_.island[g].pass(group, a_.coarse_sum);
+        if (group.leads() && !a_.island[g].is_done()) numbers.searching = 1;
       });
       searching = numbers.searching != 0;
     }
@@ -312,34 +312,29 @@ class ContactCorrection {
   // What planes, spheres and pairs add to a component.
   template <class Group, class Forces>
   PD_HD void sum_forces(int g, const Group& group, const Forces& forces) const {
-    double walls[ContactSums::count] = {}, sums[ContactSums::count] = {};
+    double sums[ContactSums::count] = {};
     if (env_.walls.exist()) {
       const CoarseTrial<double> trial = a_.island[a_.root[g]].trial_of(a_.coarse_body[g]);
-      group.sum_range(
-          a_.component_begin[g], a_.component_end[g],
-          [&](int v, auto& sum) {
-            if (a_.component[v] != g) return;
-            const int i = a_.inside[v];
-            each_contact_term(env_.walls, coarse_vertex(i), trial, forces(i),
-                              [&](bool adds, const auto& terms) {
-                                if (adds) add_terms(sum, terms());
-                              });
-          },
-          walls);
+      group.add_range(a_.component_begin[g], a_.component_end[g], [&](int v) {
+        if (a_.component[v] != g) return;
+        const int i = a_.inside[v];
+        each_contact_term(env_.walls, coarse_vertex(i), trial, forces(i),
+                          [&](bool adds, const auto& terms) {
+                            if (adds) add_terms(sums, terms());
+                          });
+      });
     }
-    group.sum_range(
-        a_.side_start[g], a_.side_start[g + 1],
-        [&](int n, auto& sum) {
-          const int p = a_.side_pair[n], a = component_of(p, 0), side = a == g ? 0 : 1;
-          const PairTerms& of = a_.terms[p];
-          const bool counts = side == 0 || a < 0;
-          if (of.resists()) return add_terms(sum, of.of_side(side, counts));
-          if (counts) sum[ContactSums::before] += of.before;  // no force: the other numbers are 0
-        },
-        sums);
+    group.add_range(a_.side_start[g], a_.side_start[g + 1], [&](int n) {
+      const int p = a_.side_pair[n], a = component_of(p, 0), side = a == g ? 0 : 1;
+      const PairTerms& of = a_.terms[p];
+      const bool counts = side == 0 || a < 0;
+      if (of.resists()) return add_terms(sums, of.of_side(side, counts));
+      if (counts) sums[ContactSums::before] += of.before;  // no force: the other numbers are 0
+    });
+    group.add_up(sums);
     if (!group.leads()) return;
     for (int n = 0; n < ContactSums::count; ++n)
-      a_.coarse_sum[g * ContactSums::count + n] = walls[n] + sums[n];
+      a_.coarse_sum[g * ContactSums::count + n] = sums[n];
   }
 
   template <class Group>

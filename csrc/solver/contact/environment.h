@@ -11,8 +11,9 @@
 //   warps(count, visit)    visit(n, lanes) for every n by 32 lanes of solver/contact/clusters.h
 //   each_closest(count, pair_at, places, visit)  visit(n, closest points) of pairs, and a barrier
 //   blocks<T>(count, visit)  visit(lanes) for blocks of items in vector instructions, and a barrier
-//   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own, and
-//                          select: items in their order
+//   groups(count, visit)   a group of threads for each number, with sum_range and least_range over items of its own,
+//                          select: items in their order, spread_of_group and each_of_group(count, item),
+//                          each_below(begin, end, item): item(row, column) of a triangle, and lead(task): one thread
 //
 // All threads of a team take the same branches: what they decide by is not written in the phase that follows.
 #pragma once
@@ -89,7 +90,7 @@ struct ActiveRows {
         integers(reinterpret_cast<int*>(memory + count * (std::int64_t(capacity) + padding))),
         stride(std::int64_t(capacity) + padding) {}
 
-  PD_HD static std::int64_t size(int capacity) {
+  PD_HD static constexpr std::int64_t size(int capacity) {
     return (count + 5) * (std::int64_t(capacity) + padding);
   }
   PD_HD T* row(int n) const { return numbers + n * stride; }
@@ -113,13 +114,14 @@ struct ContactArrays {
   Four<T>* moved_by;              // [vertices] by active pairs, m
   // Entries of vertices: corners of their pairs, in the order of the pairs.
   int *start, *cursor;  // [vertices + 1] first entry of each; counts
-  int *entry, *slot;    // [4 capacity] pair * 4 + corner in any order; the entry of each corner
+  // [4 capacity] pair * 4 + corner in any order; the entry of each corner; and the corner of each entry
+  int *entry, *slot, *corner;
   Four<T>*push,
       *space;  // [4 capacity] by entry: force of the pair and weight; normal and bound of a half-space
   T* margin;                            // [4 capacity] of the half-space
-  T* rows;                              // ActiveRows
+  T* rows;                              // ActiveRows of `most_rows`
+  int* row_of;                          // [most_rows] of a pair, -1: none
   ContactPair<T>* pair;                 // [capacity] in the order of their keys
-  unsigned char* active;                // [capacity]
   std::int64_t* known_key;              // [capacity] of the list before
   Multiplier<T>* known_force;           // [capacity]
   int *owner, *partner;                 // [capacity] parts of a pair
@@ -187,11 +189,12 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   for (int** array : {&a.start, &a.cursor}) arena.place(*array, v + 1);
   arena.place(a.entry, 4 * m + 1);
   arena.place(a.slot, 4 * m);
+  arena.place(a.corner, 4 * m);
   for (Four<T>** array : {&a.push, &a.space}) arena.place(*array, 4 * m);
   arena.place(a.margin, 4 * m);
   arena.place(a.rows, ActiveRows<T>::size(plan.capacity));
+  arena.place(a.row_of, m);
   arena.place(a.pair, m);
-  arena.place(a.active, m);
   arena.place(a.known_key, m);
   arena.place(a.known_force, m);
   for (int** array : {&a.owner, &a.partner}) arena.place(*array, m);
@@ -311,6 +314,7 @@ struct ContactEnvironment {
   const T *poses, *goal_poses;      // [colliders, 7] at the start, and of the step's end
   const std::int64_t* history_key;  // [capacity]
   const T* history_force;           // [capacity, 4]
+  int most_rows;                    // of ContactArrays::rows, no less than pairs
 
   PD_HD bool held(int v) const { return a.held[v] != 0; }
   PD_HD int owners() const { return plan.points + plan.edges; }
@@ -329,15 +333,12 @@ struct ContactEnvironment {
       raise(a.limits + pair.vertex[corner], int(pair.plane.frozen ? limits_stuck : limits_planes));
     }
   }
-  // The force of a pair, by entries; zeros where it does not count.
-  PD_HD void keep_pushes(int p, bool counts) const {
+  // The force of a pair, by entries.
+  PD_HD void keep_pushes(int p) const {
     const ContactPair<T>& pair = a.pair[p];
     const Vec3<T> force = multiply_add(pair.force.normal, pair.normal, pair.force.tangential);
-    for (int corner = 0; corner < 4; ++corner) {
-      Four<T> push = {T(0), T(0), T(0), T(0)};
-      if (counts) push = {force.x, force.y, force.z, pair.near.weight[corner]};
-      a.push[a.slot[4 * p + corner]] = push;
-    }
+    for (int corner = 0; corner < 4; ++corner)
+      a.push[a.slot[4 * p + corner]] = {force.x, force.y, force.z, pair.near.weight[corner]};
   }
   // The force of all pairs on a vertex, after keep_pushes.
   PD_HD Vec3<T> force_on(int v) const {

@@ -15,23 +15,29 @@ class ContactProx {
   using Rows = ActiveRows<T>;
 
   PD_HD explicit ContactProx(const Env& env)
-      : env_(env), a_(env.a), rows_(env.a.rows, env.plan.capacity) {}
+      : env_(env), a_(env.a), rows_(env.a.rows, env.most_rows) {}
 
-  // Moves targets and forces. c = theta omega
+  // Closest points at the present iterate, and the pairs that are active. c = theta omega
   template <class Team>
-  PD_HD void run(const Team& team, T c) const {
+  PD_HD void take(const Team& team, int pairs, T c) const {
+    team.each_closest(
+        pairs, [&](int p) -> const auto& { return a_.pair[p]; }, a_.place,
+        [&](int p, const Closest<T>& near) { take_pair<Team>(p, near, c); });
+  }
+
+  // After take. Moves targets and forces.
+  template <class Team>
+  PD_HD void run(const Team& team) const {
     ContactNumbers& numbers = env_.numbers();
-    team.each(numbers.pairs, [&](int p) { take<Team>(p, c); });
     const int active = numbers.active, moved = numbers.moved;
     if (active == 0) return;
-    push(team, active, moved, c, true);
+    push(team, active, moved, true);
     for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
-      team.template blocks<T>(active, [&](const auto& lanes) {
-        advance<Team>(lanes, numbers.changes[sweep], sweep == 0);
-      });
+      team.template blocks<T>(
+          active, [&](const auto& lanes) { advance(lanes, numbers.changes[sweep], sweep == 0); });
       // a further sweep would change nothing either
       if (!numbers.changes[sweep]) break;
-      push(team, active, moved, c, false);
+      push(team, active, moved, false);
     }
     team.spread(active, [&](int q) {
       a_.pair[rows_.pair(q)].force = {
@@ -48,23 +54,21 @@ class ContactProx {
   }
 
  private:
-  // Takes a pair among the active ones.
   template <class Team>
-  PD_HD void take(int p, T c) const {
+  PD_HD void take_pair(int p, const Closest<T>& near, T c) const {
     ContactPair<T>& pair = a_.pair[p];
+    pair.look(near);
     Vec3<T> corner[4];
     pair.corners(a_.target, corner);
     const Vec3<T> between = combined(pair.near.weight, corner);
     const bool acts = pair.force.normal > T(0) || !(pair.thickness <= dot(pair.normal, between)),
                active = acts && pair.can_yield(a_.inverse);
     if (acts && !active) pair.force = {};  // nothing can yield
-    if constexpr (!Team::in_order) {
-      if (a_.active[p] && !active) env_.keep_pushes(p, false);
-      a_.active[p] = active;
-    }
+    if constexpr (!Team::in_order) a_.row_of[p] = -1;
     if (!active) return;
     const int q = count_one(&env_.numbers().active);
     rows_.pair(q) = p;
+    if constexpr (!Team::in_order) a_.row_of[p] = q;
     const auto put = [&](int row, const Vec3<T>& from) {
       rows_.at(row, q) = from.x, rows_.at(row + 1, q) = from.y, rows_.at(row + 2, q) = from.z;
     };
@@ -86,45 +90,38 @@ class ContactProx {
       rows_.at(Rows::moves + corner, q) = c * weight * a_.inverse[v];
       if (take_first(a_.touched + v)) a_.moved[count_one(&env_.numbers().moved)] = v;
     }
-    if constexpr (!Team::in_order) keep_push(q);
-  }
-
-  PD_HD void keep_push(int q) const {
-    for (int corner = 0; corner < 4; ++corner)
-      a_.push[a_.slot[4 * rows_.pair(q) + corner]] = {
-          rows_.at(Rows::force, q), rows_.at(Rows::force + 1, q), rows_.at(Rows::force + 2, q),
-          rows_.at(Rows::weight + corner, q)};
   }
 
   // How forces move the vertices; `first`: and S of every vertex.
   template <class Team>
-  PD_HD void push(const Team& team, int active, int moved, T c, bool first) const {
+  PD_HD void push(const Team& team, int active, int moved, bool first) const {
+    const auto add = [&](int q, int corner, T& weight, Four<T>& by) {
+      const Four<T> force{rows_.at(Rows::force, q), rows_.at(Rows::force + 1, q),
+                          rows_.at(Rows::force + 2, q), T(0)};
+      if (first) weight = weight + absolute(rows_.at(Rows::weight + corner, q));
+      by = multiply_add(rows_.at(Rows::moves + corner, q), force, by);
+    };
     if constexpr (Team::in_order) {
       team.each(moved, [&](int n) {
         a_.moved_by[a_.moved[n]] = {T(0), T(0), T(0), T(0)};
         if (first) a_.weight[a_.moved[n]] = T(0);
       });
       team.each(active, [&](int q) {
-        const Four<T> force{rows_.at(Rows::force, q), rows_.at(Rows::force + 1, q),
-                            rows_.at(Rows::force + 2, q), T(0)};
         PD_UNROLL
         for (int corner = 0; corner < 4; ++corner) {
           const int v = rows_.vertex(corner, q);
-          if (first) a_.weight[v] = a_.weight[v] + absolute(rows_.at(Rows::weight + corner, q));
-          a_.moved_by[v] = multiply_add(rows_.at(Rows::moves + corner, q), force, a_.moved_by[v]);
+          add(q, corner, a_.weight[v], a_.moved_by[v]);
         }
       });
     } else {
       team.each(moved, [&](int n) {
         const int v = a_.moved[n], end = a_.start[v + 1];
-        const T inverse = a_.inverse[v];
         Four<T> by{T(0), T(0), T(0), T(0)};
         T weight(0);
         PD_UNROLL_4
         for (int entry = a_.start[v]; entry < end; ++entry) {
-          const Four<T> of = a_.push[entry];
-          weight = weight + absolute(of.w);
-          by = multiply_add(c * of.w * inverse, of, by);
+          const int corner = a_.corner[entry], q = a_.row_of[corner / 4];
+          if (q >= 0) add(q, corner % 4, weight, by);
         }
         a_.moved_by[v] = by;
         if (first) a_.weight[v] = weight;
@@ -132,7 +129,7 @@ class ContactProx {
     }
   }
 
-  template <class Team, class Lanes>
+  template <class Lanes>
   PD_HD void advance(const Lanes& lanes, int& changes, bool first) const {
     using P = typename Lanes::Number;
     if (first) {
@@ -172,7 +169,6 @@ class ContactProx {
     if (!lanes.all(same(old.normal, next.normal) && same(was.x, is.x) && same(was.y, is.y) &&
                    same(was.z, is.z)))
       changes = 1;
-    if constexpr (!Team::in_order) lanes.each([&](int q) { keep_push(q); });
   }
 
   const Env& env_;

@@ -327,12 +327,9 @@ class ContactSearch {
       int rank = 0;
       for (int n = begin; n < a.start[v + 1]; ++n) rank += a.entry[n] < e;
       a.slot[e] = begin + rank;
+      a.corner[begin + rank] = e;
     });
-    team.each(count, [&](int p) {
-      a.active[p] = 0;
-      env_.keep_spaces(p);
-      env_.keep_pushes(p, false);
-    });
+    team.each(count, [&](int p) { env_.keep_spaces(p); });
   }
 
   const Env& env_;

@@ -202,6 +202,13 @@ class SerialTeam {
   void sum_range(int begin, int end, const Add& add, double (&sums)[Count]) const {
     for (int i = begin; i < end; ++i) add(i, sums);
   }
+  // the same in parts: items of its own, and then what all have added
+  template <class Add>
+  void add_range(int begin, int end, const Add& add) const {
+    for (int i = begin; i < end; ++i) add(i);
+  }
+  template <int Count>
+  void add_up(double (&)[Count]) const {}
   template <int Count, class Take>
   void least_range(int begin, int end, const Take& take, double (&least)[Count]) const {
     for (int i = begin; i < end; ++i) take(i, least);
@@ -213,6 +220,24 @@ class SerialTeam {
       if (is(i)) *out++ = i;
   }
   bool leads() const { return true; }
+  template <class Task>
+  void lead(const Task& task) const {
+    task();
+  }
+  template <class Item>
+  void spread_of_group(int count, const Item& item) const {
+    for (int i = 0; i < count; ++i) item(i);
+  }
+  template <class Item>
+  void each_of_group(int count, const Item& item) const {
+    spread_of_group(count, item);
+  }
+  template <class Item>
+  void each_below(int begin, int end, const Item& item) const {
+    for (int c = begin; c < end; ++c) {
+      for (int r = c; r < end; ++r) item(r, c);
+    }
+  }
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -186,9 +186,10 @@ class ContactSteps {
       });
     } else {
       want(team, body_.free);
-      look(team, pairs);
+      team.barrier();
+      prox_.take(team, pairs, of.c);
       if (of.guards) merits = check(team, pairs, of.energy);
-      if (pairs > 0) prox_.run(team, of.c);
+      prox_.run(team);
       watch(team, pairs, true);
     }
     prepare(team, k);
@@ -212,7 +213,7 @@ class ContactSteps {
     team.each(pairs, [&](int p) {
       const ContactPair<T>& pair = a_.pair[p];
       lower(a_.most + plan_.colliders + 1, pair.near.distance / pair.thickness);
-      env_.keep_pushes(p, true);
+      env_.keep_pushes(p);
     });
     team.each(plan_.vertices, [&](int v) {
       const Vec3<T> force = env_.force_on(v);
@@ -314,11 +315,7 @@ class ContactSteps {
   PD_HD void look(const Team& team, int pairs) const {
     team.each_closest(
         pairs, [&](int p) -> const auto& { return a_.pair[p]; }, a_.place,
-        [&](int p, const Closest<T>& near) {
-          ContactPair<T>& pair = a_.pair[p];
-          pair.near = near;
-          pair.normal = pair.normal_at(near);
-        });
+        [&](int p, const Closest<T>& near) { a_.pair[p].look(near); });
   }
 
   // E + psi at the last check and now, both by the list and the multipliers of now.
