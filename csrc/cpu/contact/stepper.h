@@ -58,8 +58,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
              contact.history.poses + 7 * e_ * contact.plan.colliders,
              contact.poses + 7 * e_ * contact.plan.colliders,
              contact.history.keys + e_ * contact.plan.capacity,
-             contact.history.forces + 4 * e_ * contact.plan.capacity,
-             contact.plan.capacity},
+             contact.history.forces + 4 * e_ * contact.plan.capacity},
         steps_(env_) {}
 
   void rollout() {

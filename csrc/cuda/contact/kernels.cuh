@@ -37,22 +37,19 @@ struct ContactKernel {
   int chunks, teams, blocks, k, trial;
 };
 
-// Rows of active pairs, and what they move, in shared memory: for an iteration by one block.
+// The first rows of active pairs, and what they move, in shared memory: for an iteration by one block.
 template <class T>
 struct SharedRows {
-  static constexpr int pairs = 320, vertices = 256;
+  static constexpr int pairs = 512, vertices = 256;
   alignas(16) Four<T> moved_by[vertices];
   T weight[vertices];
   int row_of[pairs];
-  alignas(16) T rows[ActiveRows<T>::size(pairs)];
+  alignas(16) T rows[ActiveRow<T>::chunk];
 
-  // Whether it has room; if not, they stay where they are.
-  PD_DEVICE static bool fits(const ContactPlan<T>& plan, const ContactArrays<T>& arrays) {
-    return plan.vertices <= vertices && arrays.numbers->pairs <= pairs;
-  }
-  PD_DEVICE void lend(ContactArrays<T>& arrays) {
-    arrays.moved_by = moved_by, arrays.weight = weight;
-    arrays.row_of = row_of, arrays.rows = rows;
+  PD_DEVICE void lend(const ContactPlan<T>& plan, ContactArrays<T>& arrays) {
+    arrays.first_rows = rows;
+    if (arrays.numbers->pairs <= pairs) arrays.row_of = row_of;
+    if (plan.vertices <= vertices) arrays.moved_by = moved_by, arrays.weight = weight;
   }
 };
 
@@ -115,8 +112,7 @@ PD_DEVICE BodyState<T> body_state(const ContactKernel<T>& call, std::int64_t e) 
 
 template <class T>
 PD_DEVICE ContactEnvironment<T> environment_of(const ContactKernel<T>& call,
-                                               const ContactArrays<T>& arrays, int most_rows,
-                                               std::int64_t e) {
+                                               const ContactArrays<T>& arrays, std::int64_t e) {
   const ContactWork<T>& w = call.work;
   const ContactPlan<T>& plan = w.contact.plan;
   const int planes = w.material.planes_count, spheres = w.material.spheres_count;
@@ -128,8 +124,7 @@ PD_DEVICE ContactEnvironment<T> environment_of(const ContactKernel<T>& call,
           w.contact.history.poses + e * plan.colliders * 7,
           w.contact.poses + e * plan.colliders * 7,
           w.contact.history.keys + e * plan.capacity,
-          w.contact.history.forces + 4 * e * plan.capacity,
-          most_rows};
+          w.contact.history.forces + 4 * e * plan.capacity};
 }
 
 template <class T>
@@ -236,8 +231,15 @@ PD_DEVICE void write_free(const ContactWork<T>& w, const FreeMotion<T>& motion,
               [&](int n) { w.out_info[e * info_count + n] = w.free_info[e * info_count + n]; });
 }
 
+// Blocks on a multiprocessor: iterations wait for memory, and coarse corrections need many registers.
+template <class T>
+constexpr int blocks_at_once(ContactTask task) {
+  if (task == ContactTask::correct) return 2;
+  return sizeof(T) == 8 ? 2 : task == ContactTask::iterate ? 6 : 4;
+}
+
 template <ContactTask What, class T>
-__global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
+__global__ void __launch_bounds__(contact_threads, blocks_at_once<T>(What))
     contact_task(const __grid_constant__ ContactKernel<T> call) {
   __shared__ ContactArrays<T> arrays;
   const int number = int(blockIdx.x) / call.blocks, thread = int(threadIdx.x);
@@ -271,14 +273,11 @@ __global__ void __launch_bounds__(contact_threads, sizeof(T) == 4 ? 4 : 2)
         continue;
       }
     }
-    int most_rows = plan.capacity;
-    if (What == ContactTask::iterate && call.blocks == 1 && SharedRows<T>::fits(plan, arrays)) {
-      most_rows = SharedRows<T>::pairs;
-      __syncthreads();  // all have read
-      if (thread == 0) reinterpret_cast<SharedRows<T>*>(contact_shared())->lend(arrays);
+    if (What == ContactTask::iterate && call.blocks == 1) {
+      if (thread == 0) reinterpret_cast<SharedRows<T>*>(contact_shared())->lend(plan, arrays);
       __syncthreads();
     }
-    const ContactEnvironment<T> environment = environment_of(call, arrays, most_rows, e);
+    const ContactEnvironment<T> environment = environment_of(call, arrays, e);
     const ContactSteps<T> steps(environment);
     T* const forces = w.contact.forces + 3 * e * plan.vertices;
     if constexpr (What == ContactTask::start) {

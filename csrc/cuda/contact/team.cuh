@@ -37,8 +37,9 @@ struct SingleLane {
   using Number = T;
   int item;
 
-  PD_DEVICE T load(const T* row) const { return row[item]; }
-  PD_DEVICE void store(T* row, T value) const { row[item] = value; }
+  PD_DEVICE int begin() const { return item; }
+  PD_DEVICE static T load(const T* from) { return *from; }
+  PD_DEVICE static void store(T* to, T value) { *to = value; }
   template <class Get>
   PD_DEVICE Vec3<T> vector(const Get& get) const {
     const auto of = get(item);

@@ -145,8 +145,9 @@ MeshPatch make_patch(const Mesh& mesh, int index, std::vector<std::int32_t>& num
     for (std::int32_t& corner : own.corner) corner = slot[corner];
   }
   order_pairs(patch, index, mesh.numbering);
-  patch.piped = mesh.kernel == stream_kernel && mesh.elements.groups.empty() &&
-                std::ssize(patch.vertex) <= pipeline_slots;
+  // a single patch has the sums of kernel `block`, which may take its step (cuda/stream/contact_runner.cuh)
+  patch.piped = mesh.kernel == stream_kernel && mesh.partition.patches() > 1 &&
+                mesh.elements.groups.empty() && std::ssize(patch.vertex) <= pipeline_slots;
   patch.place(patch.piped);
   if (has_rows(mesh.elements)) make_rows(patch, mesh.elements);
   return patch;

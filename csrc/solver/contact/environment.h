@@ -72,31 +72,43 @@ PD_HD Four<T> multiply_add(T s, const Four<T>& a, const Four<T>& b) {
 }
 #endif
 
-// What active pairs keep over the sweeps of an iteration, row by row.
+// What an active pair keeps over the sweeps of an iteration: numbers side by side with those of others.
 template <class T>
-struct ActiveRows {
+struct ActiveRow {
   static constexpr int weight = 0, moves = 4,  // of the corners; theta omega w / D
       between = 8, before = 11, normal = 14,   // sums w x of targets, and at the step's start
       tangential = 17, normal_force = 20, force = 21, beta = 24, thickness = 25, friction = 26,
-                       count = 27;
-  static constexpr int padding = 16;  // lanes past the last pair
+                       count = 27, integers_count = 5;
+  static constexpr int stride = 192;  // pairs of a chunk; a multiple of all lanes
+  static constexpr std::int64_t chunk =
+      count * stride +
+      (integers_count * stride * int(sizeof(int)) + int(sizeof(T)) - 1) / int(sizeof(T));
 
-  T* numbers;     // [count, stride]
-  int* integers;  // [5, stride]: pair, vertices
-  std::int64_t stride;
+  T* numbers;
+  int* integers;  // pair, vertices
 
-  PD_HD ActiveRows(T* memory, int capacity)
-      : numbers(memory),
-        integers(reinterpret_cast<int*>(memory + count * (std::int64_t(capacity) + padding))),
-        stride(std::int64_t(capacity) + padding) {}
+  PD_HD ActiveRow(T* of_chunk, int at)
+      : numbers(of_chunk + at), integers(reinterpret_cast<int*>(of_chunk + count * stride) + at) {}
 
-  PD_HD static constexpr std::int64_t size(int capacity) {
-    return (count + 5) * (std::int64_t(capacity) + padding);
+  PD_HD T* place(int n) const { return numbers + n * stride; }
+  PD_HD T& operator[](int n) const { return numbers[n * stride]; }
+  PD_HD int& pair() const { return integers[0]; }
+  PD_HD int& vertex(int corner) const { return integers[(1 + corner) * stride]; }
+};
+
+// Those of all active pairs, chunk by chunk. The first chunk may be elsewhere.
+template <class T>
+struct ActiveRows {
+  T *first, *chunks;
+
+  PD_HD static std::int64_t size(int capacity) {
+    const int stride = ActiveRow<T>::stride;
+    return (std::int64_t(capacity) + stride) / stride * ActiveRow<T>::chunk;
   }
-  PD_HD T* row(int n) const { return numbers + n * stride; }
-  PD_HD T& at(int n, int q) const { return row(n)[q]; }
-  PD_HD int& pair(int q) const { return integers[q]; }
-  PD_HD int& vertex(int corner, int q) const { return integers[(1 + corner) * stride + q]; }
+  PD_HD ActiveRow<T> operator[](int q) const {
+    const int stride = ActiveRow<T>::stride, chunk = q / stride;
+    return {chunk == 0 ? first : chunks + chunk * ActiveRow<T>::chunk, q % stride};
+  }
 };
 
 // Whether planes that are new since the last move may cut the way of a vertex, or whether it must stay: targets have been
@@ -119,8 +131,8 @@ struct ContactArrays {
   Four<T>*push,
       *space;  // [4 capacity] by entry: force of the pair and weight; normal and bound of a half-space
   T* margin;                            // [4 capacity] of the half-space
-  T* rows;                              // ActiveRows of `most_rows`
-  int* row_of;                          // [most_rows] of a pair, -1: none
+  T *rows, *first_rows;                 // ActiveRows
+  int* row_of;                          // [capacity] of a pair, -1: none
   ContactPair<T>* pair;                 // [capacity] in the order of their keys
   std::int64_t* known_key;              // [capacity] of the list before
   Multiplier<T>* known_force;           // [capacity]
@@ -193,6 +205,7 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   for (Four<T>** array : {&a.push, &a.space}) arena.place(*array, 4 * m);
   arena.place(a.margin, 4 * m);
   arena.place(a.rows, ActiveRows<T>::size(plan.capacity));
+  a.first_rows = a.rows;
   arena.place(a.row_of, m);
   arena.place(a.pair, m);
   arena.place(a.known_key, m);
@@ -314,7 +327,6 @@ struct ContactEnvironment {
   const T *poses, *goal_poses;      // [colliders, 7] at the start, and of the step's end
   const std::int64_t* history_key;  // [capacity]
   const T* history_force;           // [capacity, 4]
-  int most_rows;                    // of ContactArrays::rows, no less than pairs
 
   PD_HD bool held(int v) const { return a.held[v] != 0; }
   PD_HD int owners() const { return plan.points + plan.edges; }

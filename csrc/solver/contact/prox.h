@@ -12,10 +12,10 @@ template <class T>
 class ContactProx {
  public:
   using Env = ContactEnvironment<T>;
-  using Rows = ActiveRows<T>;
+  using Row = ActiveRow<T>;
 
   PD_HD explicit ContactProx(const Env& env)
-      : env_(env), a_(env.a), rows_(env.a.rows, env.most_rows) {}
+      : env_(env), a_(env.a), rows_{env.a.first_rows, env.a.rows} {}
 
   // Closest points at the present iterate, and the pairs that are active. c = theta omega
   template <class Team>
@@ -40,10 +40,8 @@ class ContactProx {
       push(team, active, moved, false);
     }
     team.spread(active, [&](int q) {
-      a_.pair[rows_.pair(q)].force = {
-          rows_.at(Rows::normal_force, q),
-          {rows_.at(Rows::tangential, q), rows_.at(Rows::tangential + 1, q),
-           rows_.at(Rows::tangential + 2, q)}};
+      const Row row = rows_[q];
+      a_.pair[row.pair()].force = {row[Row::normal_force], vector(row, Row::tangential)};
     });
     team.each(moved, [&](int n) {
       const int v = a_.moved[n];
@@ -67,39 +65,41 @@ class ContactProx {
     if constexpr (!Team::in_order) a_.row_of[p] = -1;
     if (!active) return;
     const int q = count_one(&env_.numbers().active);
-    rows_.pair(q) = p;
+    const Row row = rows_[q];
+    row.pair() = p;
     if constexpr (!Team::in_order) a_.row_of[p] = q;
-    const auto put = [&](int row, const Vec3<T>& from) {
-      rows_.at(row, q) = from.x, rows_.at(row + 1, q) = from.y, rows_.at(row + 2, q) = from.z;
+    const auto put = [&](int n, const Vec3<T>& from) {
+      row[n] = from.x, row[n + 1] = from.y, row[n + 2] = from.z;
     };
     Vec3<T> before[4];
     pair.corners(a_.begin, before);
-    put(Rows::between, between);
-    put(Rows::before, combined(pair.near.weight, before));
-    put(Rows::normal, pair.normal);
-    put(Rows::tangential, pair.force.tangential);
-    put(Rows::force, multiply_add(pair.force.normal, pair.normal, pair.force.tangential));
-    rows_.at(Rows::normal_force, q) = pair.force.normal;
-    rows_.at(Rows::thickness, q) = pair.thickness;
-    rows_.at(Rows::friction, q) = pair.friction;
+    put(Row::between, between);
+    put(Row::before, combined(pair.near.weight, before));
+    put(Row::normal, pair.normal);
+    put(Row::tangential, pair.force.tangential);
+    put(Row::force, multiply_add(pair.force.normal, pair.normal, pair.force.tangential));
+    row[Row::normal_force] = pair.force.normal;
+    row[Row::thickness] = pair.thickness;
+    row[Row::friction] = pair.friction;
     for (int corner = 0; corner < 4; ++corner) {
       const int v = pair.vertex[corner];
       const T weight = pair.near.weight[corner];
-      rows_.vertex(corner, q) = v;
-      rows_.at(Rows::weight + corner, q) = weight;
-      rows_.at(Rows::moves + corner, q) = c * weight * a_.inverse[v];
+      row.vertex(corner) = v;
+      row[Row::weight + corner] = weight;
+      row[Row::moves + corner] = c * weight * a_.inverse[v];
       if (take_first(a_.touched + v)) a_.moved[count_one(&env_.numbers().moved)] = v;
     }
   }
 
+  PD_HD static Vec3<T> vector(const Row& row, int n) { return {row[n], row[n + 1], row[n + 2]}; }
+
   // How forces move the vertices; `first`: and S of every vertex.
   template <class Team>
   PD_HD void push(const Team& team, int active, int moved, bool first) const {
-    const auto add = [&](int q, int corner, T& weight, Four<T>& by) {
-      const Four<T> force{rows_.at(Rows::force, q), rows_.at(Rows::force + 1, q),
-                          rows_.at(Rows::force + 2, q), T(0)};
-      if (first) weight = weight + absolute(rows_.at(Rows::weight + corner, q));
-      by = multiply_add(rows_.at(Rows::moves + corner, q), force, by);
+    const auto add = [&](const Row& row, int corner, T& weight, Four<T>& by) {
+      const Four<T> force{row[Row::force], row[Row::force + 1], row[Row::force + 2], T(0)};
+      if (first) weight = weight + absolute(row[Row::weight + corner]);
+      by = multiply_add(row[Row::moves + corner], force, by);
     };
     if constexpr (Team::in_order) {
       team.each(moved, [&](int n) {
@@ -107,10 +107,11 @@ class ContactProx {
         if (first) a_.weight[a_.moved[n]] = T(0);
       });
       team.each(active, [&](int q) {
+        const Row row = rows_[q];
         PD_UNROLL
         for (int corner = 0; corner < 4; ++corner) {
-          const int v = rows_.vertex(corner, q);
-          add(q, corner, a_.weight[v], a_.moved_by[v]);
+          const int v = row.vertex(corner);
+          add(row, corner, a_.weight[v], a_.moved_by[v]);
         }
       });
     } else {
@@ -121,7 +122,7 @@ class ContactProx {
         PD_UNROLL_4
         for (int entry = a_.start[v]; entry < end; ++entry) {
           const int corner = a_.corner[entry], q = a_.row_of[corner / 4];
-          if (q >= 0) add(q, corner % 4, weight, by);
+          if (q >= 0) add(rows_[q], corner % 4, weight, by);
         }
         a_.moved_by[v] = by;
         if (first) a_.weight[v] = weight;
@@ -134,36 +135,38 @@ class ContactProx {
     using P = typename Lanes::Number;
     if (first) {
       lanes.each([&](int q) {
+        const Row row = rows_[q];
         T sum(0);
         for (int corner = 0; corner < 4; ++corner)
-          sum = multiply_add(absolute(rows_.at(Rows::moves + corner, q)),
-                             a_.weight[rows_.vertex(corner, q)], sum);
-        rows_.at(Rows::beta, q) = T(1) / sum;
+          sum =
+              multiply_add(absolute(row[Row::moves + corner]), a_.weight[row.vertex(corner)], sum);
+        row[Row::beta] = T(1) / sum;
       });
     }
-    const auto load = [&](int row) { return lanes.load(rows_.row(row)); };
-    const auto vector = [&](int row) { return Vec3<P>{load(row), load(row + 1), load(row + 2)}; };
-    const auto store = [&](int row, const Vec3<P>& value) {
-      lanes.store(rows_.row(row), value.x);
-      lanes.store(rows_.row(row + 1), value.y);
-      lanes.store(rows_.row(row + 2), value.z);
+    const Row row = rows_[lanes.begin()];  // lanes lie side by side
+    const auto load = [&](int n) { return lanes.load(row.place(n)); };
+    const auto vector = [&](int n) { return Vec3<P>{load(n), load(n + 1), load(n + 2)}; };
+    const auto store = [&](int n, const Vec3<P>& value) {
+      lanes.store(row.place(n), value.x);
+      lanes.store(row.place(n + 1), value.y);
+      lanes.store(row.place(n + 2), value.z);
     };
     const Vec3<P> moved = lanes.vector([&](int q) {
-      const auto by = [&](int corner) { return a_.moved_by[rows_.vertex(corner, q)]; };
-      const auto weight = [&](int corner) { return rows_.at(Rows::weight + corner, q); };
-      Four<T> sum = multiply_add(weight(0), by(0), Four<T>{T(0), T(0), T(0), T(0)});
+      const Row own = rows_[q];
+      const auto by = [&](int corner) { return a_.moved_by[own.vertex(corner)]; };
+      Four<T> sum = multiply_add(own[Row::weight], by(0), Four<T>{T(0), T(0), T(0), T(0)});
       for (int corner = 1; corner < 4; ++corner)
-        sum = multiply_add(weight(corner), by(corner), sum);
+        sum = multiply_add(own[Row::weight + corner], by(corner), sum);
       return sum;
     });
-    const Vec3<P> normal = vector(Rows::normal);
-    const Multiplier<P> old{load(Rows::normal_force), vector(Rows::tangential)};
+    const Vec3<P> normal = vector(Row::normal);
+    const Multiplier<P> old{load(Row::normal_force), vector(Row::tangential)};
     const Multiplier<P> next =
-        pd::advance(old, load(Rows::beta), load(Rows::thickness), load(Rows::friction), normal,
-                    vector(Rows::between) + moved, vector(Rows::before));
-    lanes.store(rows_.row(Rows::normal_force), next.normal);
-    store(Rows::tangential, next.tangential);
-    store(Rows::force, multiply_add(next.normal, normal, next.tangential));
+        pd::advance(old, load(Row::beta), load(Row::thickness), load(Row::friction), normal,
+                    vector(Row::between) + moved, vector(Row::before));
+    lanes.store(row.place(Row::normal_force), next.normal);
+    store(Row::tangential, next.tangential);
+    store(Row::force, multiply_add(next.normal, normal, next.tangential));
     const auto same = [](const P& a, const P& b) { return a <= b && b <= a; };
     const Vec3<P>&was = old.tangential, &is = next.tangential;
     if (!lanes.all(same(old.normal, next.normal) && same(was.x, is.x) && same(was.y, is.y) &&
@@ -173,7 +176,7 @@ class ContactProx {
 
   const Env& env_;
   const ContactArrays<T>& a_;
-  const Rows rows_;
+  const ActiveRows<T> rows_;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -41,8 +41,9 @@ struct VectorLanes {
   using Number = Pack<T, width>;
   int first, count;
 
-  Number load(const T* row) const { return Number::load(row + first); }
-  void store(T* row, const Number& value) const { value.store(row + first); }
+  int begin() const { return first; }
+  static Number load(const T* from) { return Number::load(from); }
+  static void store(T* to, const Number& value) { value.store(to); }
   template <class Get>
   Vec3<Number> vector(const Get& get) const {
     T number[3][width] = {};
