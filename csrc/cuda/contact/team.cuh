@@ -30,7 +30,6 @@ struct WarpLanes {
   PD_DEVICE bool leads() const { return lane() == 0; }
 };
 
-// Sums do not depend on the number of blocks: every chunk is added up by one, and all add up the chunks alike.
 // A thread's item.
 template <class T>
 struct SingleLane {
@@ -68,6 +67,7 @@ PD_DEVICE std::byte* contact_shared() {
   return shared;
 }
 
+// Sums do not depend on the number of blocks: every chunk is added up by one, and all add up the chunks alike.
 class ContactTeam {
  public:
   static constexpr bool in_order = false;
@@ -170,6 +170,7 @@ class ContactTeam {
     }
     block_sum(all);
     for (int n = 0; n < Count; ++n) sums[n] += all[n];
+    barrier();  // before another sum overwrites the parts
   }
 
   PD_DEVICE void scan(int* numbers, std::int64_t count) const {

@@ -24,12 +24,13 @@ class ContactCorrection {
   PD_HD explicit ContactCorrection(const Env& env)
       : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env) {}
 
-  // Islands of the components that listed pairs join. `numbers.corrects`: whether there is one.
+  // Islands of the components that listed pairs join, and of each other one that `touches`: a body that meets itself alone,
+  // after the last iteration. `numbers.corrects`: whether there is one.
   template <class Team>
   PD_HD void begin(const Team& team) const {
     ContactNumbers& numbers = env_.numbers();
     const int pairs = numbers.pairs, count = body_.components;
-    team.spread(1, [&](int) { numbers.corrects = numbers.searching = 0; });
+    team.spread(1, [&](int) { numbers.corrects = numbers.searching = numbers.cuts = 0; });
     team.spread(std::int64_t(count) * count, [&](int n) { a_.couple[n] = 0; });
     team.each(count, [&](int g) {
       a_.root[g] = g, a_.side_start[g] = 0;
@@ -37,6 +38,9 @@ class ContactCorrection {
     });
     team.spread(pairs, [&](int p) {
       if (is_between(a_.pair[p])) numbers.corrects = 1;
+    });
+    team.spread(count, [&](int g) {
+      if (a_.touches[g]) numbers.corrects = 1;
     });
     team.each(plan_.body_vertices, [&](int v) {
       const int g = a_.component[v];
@@ -228,7 +232,9 @@ class ContactCorrection {
     for (int g = 0; g < count; ++g) {
       a_.root[g] = root_of(a_.root, g);
       a_.size[g] = a_.valid[g] = 0;
-      a_.local[g] = a_.side_start[g] < a_.side_start[g + 1] ? a_.size[a_.root[g]]++ : -1;
+      const bool joined = a_.side_start[g] < a_.side_start[g + 1],
+                 moves = a_.touches[g] && a_.goes[g];
+      a_.local[g] = joined || moves ? a_.size[a_.root[g]]++ : -1;
     }
     int first = 0;
     for (int g = 0; g < count; first += a_.size[g++]) a_.first[g] = first;

@@ -98,9 +98,10 @@ class ContactSteps {
     go(team, false, none);
     team.each(body_.vertices,
               [&](int i) { BodyState<T>::write(body_.before, i, BodyState<T>::read(body_.u, i)); });
+    team.each(body_.components, [&](int g) { a_.touches[g] = 0; });
   }
 
-  // At the end bodies that touch no other are corrected again.
+  // At the end bodies that touch nothing are corrected again. `touches` has those that the last correction takes.
   template <class Team>
   PD_HD void go_last(const Team& team, int iterations) const {
     if (body_.components == 0) return;
