@@ -26,6 +26,7 @@ class Tuned(Protocol):
     plan: Plan
     iterations: int
     tolerance: float
+    body_contact: Any
 
     @property
     def time_step(self) -> float: ...
