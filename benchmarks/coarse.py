@@ -13,7 +13,7 @@ import sys
 import numpy as np
 import torch
 from coarse_scenes import middle_and_spin
-from machine import judge_scenes
+from judge import judge_scenes
 from numpy.typing import NDArray
 from tumbles import SEED, SOLVED, STEPS, Row, Still, random_tumble, still_problem
 

@@ -6,6 +6,12 @@ float32 or float64, and enough steps to meet. Every end of a step is checked by 
 an interrupted run resumes.
 
     python benchmarks/contact_soak.py --scenes 2000
+
+Very many run in parts, on several machines too, and are joined:
+
+    python benchmarks/contact_soak.py --summary --seconds 300 --scenes 50000 --out a.json
+    python benchmarks/contact_soak.py --summary --seconds 300 --first 50000 --scenes 50000 --out b.json
+    python benchmarks/contact_soak.py --join a.json b.json --out soak.json
 """
 
 from __future__ import annotations
@@ -18,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from machine import judge_scenes
+from judge import judge_scenes
 from scipy.spatial.transform import Rotation
 
 import torchpd as pd
@@ -127,12 +133,17 @@ def summary(rows: list[Row]) -> Row:
         "steps": sum(row["steps"] for row in used),
         "faults": [{name: row[name] for name in ("scene", "fault")} for row in used if row["fault"]],
         "nearer than the promise": sum(row["gap"] < FLOOR for row in used),
-        "least gap": min((row["gap"] for row in used), default=None),
+        "least gap": min((row["gap"] for row in used), default=math.inf),
         "scenes with pairs": sum(row["gap"] < np.inf for row in used),
         "overflows": sum(row["overflow"] > 0 for row in used),
         "seconds": sum(row["seconds"] for row in used),
     }
 
 
+def join(a: Row, b: Row) -> Row:
+    """The summary of the scenes of two summaries: numbers and faults add up, but for the least gap."""
+    return {**{name: a[name] + b[name] for name in a}, "least gap": min(a["least gap"], b["least gap"])}
+
+
 if __name__ == "__main__":
-    judge_scenes(sys.argv[1:], str(__doc__), 2000, run_scene, summary)
+    judge_scenes(sys.argv[1:], str(__doc__), 2000, run_scene, summary, join)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from machine import judge_scenes
+from judge import judge_scenes
 from tune import random_scene, random_state
 
 import torchpd as pd

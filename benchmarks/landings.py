@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from forecast import judge_auto, judgement
-from machine import judge_scenes
+from judge import judge_scenes
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 from tune import random_mesh

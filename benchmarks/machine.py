@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import fcntl
 import json
-import math
-import multiprocessing
 import os
 import shlex
 import statistics
@@ -17,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tqdm.auto import tqdm
 
 from torchpd import _C
 from torchpd.common import provenance
@@ -103,41 +99,3 @@ def describe_run(device: torch.device, threads: int) -> Record:
     """Everything needed to compare this run with another."""
     command = shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
     return provenance.describe_run(command, device, threads)
-
-
-def judge_scenes(
-    words: list[str],
-    about: str,
-    scenes: int,
-    run_scene: Callable[[int], Record],
-    summary: Callable[[list[Record]], Record],
-) -> None:
-    """Run a benchmark of random scenes from the command line, a thread each; rows in its file are kept."""
-    parser = argparse.ArgumentParser(description=about.splitlines()[0])
-    parser.add_argument("--scenes", type=int, default=scenes, help="number of random scenes (%(default)s)")
-    parser.add_argument("--processes", type=int, default=1, help="how many run side by side (%(default)s)")
-    parser.add_argument("--seconds", type=float, default=math.inf, help="stop after these, with what is done")
-    parser.add_argument("--out", type=Path, help="output file (JSON)")
-    parser.add_argument("--summary", action="store_true", help="write no rows, for very many scenes")
-    options = parser.parse_args(words)
-    now = describe_run(torch.device("cpu"), options.processes)
-    rows = {} if options.summary else {row["scene"]: row for row in earlier_rows(options.out)}
-    left = [number for number in range(options.scenes) if number not in rows]
-    begin = written = time.perf_counter()
-
-    def write() -> None:
-        kept = [rows[number] for number in sorted(rows)]
-        shown = [] if options.summary else kept
-        write_result(options.out, {"schema": 1, **now, "summary": summary(kept), "rows": shown})
-
-    with multiprocessing.get_context("spawn").Pool(options.processes, torch.set_num_threads, (1,)) as pool:
-        for row in tqdm(pool.imap_unordered(run_scene, left, chunksize=4), "scenes", len(left), unit="scene"):
-            rows[row["scene"]] = {**row, "run": run_of(now)}
-            if options.out and time.perf_counter() - written > 20.0:
-                write()
-                written = time.perf_counter()
-            if time.perf_counter() - begin > options.seconds:
-                break
-    if options.out:
-        write()
-    print(json.dumps(summary(list(rows.values())), indent=1))

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from machine import judge_scenes
+from judge import judge_scenes
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 

@@ -2,15 +2,17 @@
 
 A scene has a random mesh (bar, slivers, ball, octopus), stiffness (1e3 to 1e8 Pa) and time step (1e-3 to 1/30 s). It is
 held at one end, free, or falling on the ground. With `--contact` it is one of `contact_soak.py` at up to 3 m/s: boxes,
-a sheet and a resting collider that meet. It is tuned from one random motion and judged on steps of another, against
-the converged step in float64. Results that attain the target and refusals ("the best is ...") are counted
-separately. Judged scenes stay in the results file: an interrupted run resumes.
+a sheet and a resting collider, just before they meet. It is tuned from one random motion and judged on steps of
+another, against the converged step in float64. Results that attain the target and refusals ("the best is ...") are
+counted separately. Scenes in contact have no budgets. Judged scenes stay in the results file: an interrupted run
+resumes.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import itertools
 import json
 import sys
 import time
@@ -31,6 +33,8 @@ from torchpd.accuracy.tuning import TuningWarning
 from torchpd.estimate.convergence import has_friction
 
 JUDGED_STEPS = (1, 5, 20, 45)  # of the other motion
+MEETING_STEPS = (0, 1, 5, 20)  # the same, of bodies that come near each other in the first
+MEET = 300  # steps before which they must have
 SLACK = 1.2  # allowed time over a budget in milliseconds
 STEADY = 0.1  # allowed change of the machine's speed during the tuning for a budget
 ATTEMPTS = 6
@@ -97,41 +101,54 @@ def random_state(sim: pd.Simulator, rng: np.random.Generator) -> pd.State:
 def judge(sim: pd.Simulator, state: pd.State) -> Row:
     """Errors of steps along the motion of the tuned simulator, beside the bounds of its tuning result."""
     solved = settled_steps if sim.scene.contact or has_friction(sim.compiled) else exact_steps
-    errors, raw, trusted, audits, residuals = [], [], [], [], []
-    for step in range(max(JUDGED_STEPS) + 1):
+    errors, raw, trusted, audits, residuals, uncertainties = [], [], [], [], [], []
+    judged, gaps = MEETING_STEPS if sim.scene.contact else JUDGED_STEPS, []
+    for step in range(max(judged) + 1):
         after, info = sim(state, return_info=True)
-        if step in JUDGED_STEPS:
+        if step in judged:
             exact = solved(sim, state)[0]
             if exact.moves(sim.dtype):
                 displacement = after.velocities[0].double().numpy() * sim.time_step
                 errors.append(exact.error_beyond_rounding(displacement, sim.dtype))
+                uncertainties.append(exact.uncertainty)
                 raw.append(exact.position_error(displacement))
+                gaps.append(float(info.contact_gap[0]) if sim.scene.contact else None)
                 trusted.append(bool(sim.tuning_result.is_valid(info)[0]))
                 residuals.append(float(info.residual[0]))
                 audits.append(float(sim.tuning_result.verify(sim, state, after)[0]))
         state = after
     return {
         "errors": errors, "errors_with_rounding": raw, "trusted": trusted, "audits": audits, "residuals": residuals,
+        "uncertainties": uncertainties, "gaps": gaps,
     }  # fmt: skip
 
 
 def contact_scene(number: int, dtype: torch.dtype) -> tuple[Row, pd.Simulator, pd.State, pd.State]:
-    """Bodies that meet, and the same with three quarters of the speed."""
-    draw = 0
-    while True:
-        rng = np.random.default_rng([59, number, draw])
-        draw += 1
+    """Bodies that are about to meet, and the same with three quarters of the speed."""
+    for draw in itertools.count():
         try:
-            facts, sim, state, _ = contact_soak.random_scene(rng)
+            facts, sim, state, _ = contact_soak.random_scene(np.random.default_rng([59, number, draw]))
         except ValueError:  # places that are too near, or a thickness beyond float32
             continue
         if facts["speed"] <= 3.0 and facts["time_step"] >= 1 / 240:
-            break
+            sim, state = sim.to(dtype), state.to(sim.device, dtype)
+            slower = pd.HistoryState(state.positions, 0.75 * state.velocities, state.history)
+            pair = before_meeting(sim, state), before_meeting(sim, slower)
+            if pair[0] is not None and pair[1] is not None:
+                break
     facts = {name: facts[name] for name in ("bodies", "collider", "youngs", "time_step", "thickness", "friction")}
-    start = state.to(sim.device, dtype)
-    sim = sim.to(dtype)
-    other = pd.HistoryState(start.positions, 0.75 * start.velocities, start.history)
-    return {"mesh": "contact", "vertices": sim.vertices, **facts}, sim, start, other
+    return {"mesh": "contact", "vertices": sim.vertices, **facts}, sim, *pair
+
+
+@torch.no_grad()
+def before_meeting(sim: pd.Simulator, state: pd.HistoryState) -> pd.HistoryState | None:
+    """The start of the first step in which surfaces come near each other; None if none does."""
+    for _ in range(MEET):
+        after, info = sim(state, return_info=True)
+        if bool(info.contact_gap < torch.inf):
+            return state
+        state = after
+    return None
 
 
 def draw_scene(number: int, dtype: torch.dtype, contact: bool) -> tuple[Row, pd.Simulator, pd.State, pd.State]:
@@ -159,7 +176,7 @@ def run_scene(number: int, error: float, dtype: torch.dtype, contact: bool) -> R
     row.update(error_per_residual=result.error_per_residual, unseen_error=result.error_at_zero_residual)
     row.update(judge(sim, other))
     row["held"] = not row["errors"] or max(row["errors"]) <= result.error
-    row["budget"] = judge_budget(sim, start, other)
+    row["budget"] = None if contact else judge_budget(sim, start, other)
     return row
 
 
@@ -199,6 +216,7 @@ def suspects(row: Row) -> list[bool]:
 def summary(rows: list[Row]) -> Row:
     """Counts, separately for attained targets and refusals."""
     judged = [row for row in rows if row["errors"]]
+    timed = [row for row in rows if row["budget"]]
     visible = [row for row in judged if max(row["errors"]) > 0.0]
     kinds = {
         "attained": [r for r in judged if r["attained"]],
@@ -212,6 +230,10 @@ def summary(rows: list[Row]) -> Row:
     return {
         "scenes": len(judged),
         "without motion": len(rows) - len(judged),
+        # errors against these may be their own
+        "steps whose converged one is uncertain by half the promise": sum(
+            uncertainty > 0.5 * row["promised"] for row in judged for uncertainty in row.get("uncertainties", ())
+        ),
         **{name: {"scenes": len(group), "held": sum(r["held"] for r in group)} for name, group in kinds.items()},
         "held": sum(row["held"] for row in judged) / max(len(judged), 1),
         "held of attained": sum(r["held"] for r in kinds["attained"]) / max(len(kinds["attained"]), 1),
@@ -221,11 +243,11 @@ def summary(rows: list[Row]) -> Row:
         "budgets": {
             name: {"scenes": len(group), "kept": sum(row["budget"]["kept"] for row in group)}
             for name, group in (
-                ("at steady speed", [row for row in rows if row["budget"]["steady"]]),
-                ("speed of the machine changed", [row for row in rows if not row["budget"]["steady"]]),
+                ("at steady speed", [row for row in timed if row["budget"]["steady"]]),
+                ("speed of the machine changed", [row for row in timed if not row["budget"]["steady"]]),
             )
         },
-        "median share of budget used": float(np.median([row["budget"]["share"] for row in rows])),
+        "median share of budget used": float(np.median([row["budget"]["share"] for row in timed])) if timed else None,
         **{
             name: {
                 "steps": sum(broken == wanted for broken, *_ in steps),
@@ -269,7 +291,7 @@ def main(words: list[str]) -> None:
     for number in tqdm(wanted, desc="scenes", unit="scene"):
         if number not in rows:
             rows[number] = {**asked, **run_scene(number, options.error, dtype, options.contact), "run": run_of(now)}
-        elif options.budgets:
+        elif options.budgets and not options.contact:
             _, sim, start, other = draw_scene(number, dtype, options.contact)
             rows[number]["budget"] = {**judge_budget(sim, start, other), "commit": now["commit"]}
         else:

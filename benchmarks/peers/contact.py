@@ -15,6 +15,7 @@ below that distance, and a log barrier below half of it. Divide-and-Truncate is 
 fifth iteration. Between two detections a vertex moves by 0.425 times the detection's reach at most.
 
     python -m benchmarks.peers.contact --out benchmarks/results/peers-contact-cpu.json
+    python -m benchmarks.peers.contact --device cuda --out benchmarks/results/peers-contact-cuda.json
 
 Measured cases are kept: an interrupted run resumes.
 """
@@ -118,29 +119,45 @@ MOTIONS: dict[str, Callable[[], Motion]] = {
 
 
 class Run(NamedTuple):
-    """Positions [steps + 1, V, 3] m of the bodies, and processor time of a step."""
+    """Positions [steps + 1, V, 3] m of the bodies, and the time of a step: of the processor, or the wait for a GPU."""
 
     path: Array
     milliseconds: float
 
 
+def follow(advance: Callable[[], None], places: Callable[[], Array], steps: int, device: str) -> Run:
+    """The path of a motion of which `advance` takes the next step."""
+    clock, wait = (time.perf_counter, torch.cuda.synchronize) if device == "cuda" else (time.process_time, lambda: None)
+    path, spent = [places()], 0.0
+    for _ in range(steps):
+        wait()
+        begin = clock()
+        advance()
+        wait()
+        spent += clock() - begin
+        path.append(places())
+    return Run(np.stack(path), 1e3 * spent / steps)
+
+
 @torch.no_grad()
-def ours(motion: Motion, iterations: int, dtype: torch.dtype = torch.float32) -> Run:
-    """A motion in this library, with its default solver."""
-    sim = pd.Simulator(motion.scene(), TIME_STEP, iterations, dtype=dtype, batch=1, progress=False)
+def ours(motion: Motion, iterations: int, device: str, dtype: torch.dtype = torch.float32) -> Run:
+    """A motion in this library, with its default solver; on a GPU a CUDA graph of a step."""
+    sim = pd.Simulator(motion.scene(), TIME_STEP, iterations, dtype=dtype, batch=1, device=device, progress=False)
     state = sim.rest_state()
-    state.velocities[0] = torch.tensor(motion.velocities).to(dtype)
+    state.velocities[0] = torch.tensor(motion.velocities).to(state.velocities)
     sim(state)
-    path, spent = [state.positions[0]], 0.0
-    for _ in range(motion.steps):
-        begin = time.process_time()
+
+    def advance() -> None:
+        nonlocal state
         state = sim(state)
-        spent += time.process_time() - begin
-        path.append(state.positions[0])
-    return Run(torch.stack(path).double().numpy(), 1e3 * spent / motion.steps)
+
+    def places() -> Array:
+        return state.positions[0].double().cpu().numpy()
+
+    return follow(sim.capture(state).replay if device == "cuda" else advance, places, motion.steps, device)
 
 
-def _model(motion: Motion) -> Any:
+def _model(motion: Motion, device: str) -> Any:
     """Newton's model: all surfaces are of particles, those of the ball are held."""
     newton, warp = newton_physics.packages()
     builder = newton.ModelBuilder(up_axis=newton.Axis.Y, gravity=(0.0, motion.gravity, 0.0))
@@ -169,13 +186,13 @@ def _model(motion: Motion) -> Any:
         builder.particle_mass[vertex] = 0.0
         builder.particle_flags[vertex] &= ~int(newton.ParticleFlags.ACTIVE)
     builder.color(include_bending=True)
-    return builder.finalize(device="cpu")
+    return builder.finalize(device=device)
 
 
-def vbd(motion: Motion, iterations: int, penalty: float) -> Run:
-    """A motion in Newton's VBD with contact of all surfaces and Divide-and-Truncate."""
-    newton, _ = newton_physics.packages()
-    model = _model(motion)
+def vbd(motion: Motion, iterations: int, device: str, penalty: float) -> Run:
+    """A motion in Newton's VBD with contact of all surfaces and Divide-and-Truncate; on a GPU CUDA graphs of steps."""
+    newton, warp = newton_physics.packages()
+    model = _model(motion, device)
     model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_mu = penalty, 0.0, motion.friction
     slot, often = newton.solvers.SolverBase.CollisionSlot, newton.solvers.SolverBase.CollisionFrequencyType
     solver = newton.solvers.SolverVBD(
@@ -185,26 +202,36 @@ def vbd(motion: Motion, iterations: int, penalty: float) -> Run:
         collision_frequency_type={slot.SOFT_SELF_CONTACT: often.ITERATIONS},
         collision_frequency={slot.SOFT_SELF_CONTACT: DETECTION},
     )  # fmt: skip
-    before, after, control = model.state(), model.state(), model.control()
-    count = len(motion.start)
+    states, control = (model.state(), model.state()), model.control()
+    ways = [partial(solver.step, *pair, control, None, TIME_STEP) for pair in (states, states[::-1])]
+    count, taken = len(motion.start), 0
 
     def reset() -> None:
-        before.particle_q.assign(model.particle_q)
+        states[0].particle_q.assign(model.particle_q)
         moving = np.zeros((model.particle_count, 3), np.float32)
         moving[:count] = motion.velocities
-        before.particle_qd.assign(moving)
+        states[0].particle_qd.assign(moving)
+
+    def captured(way: Callable[[], None]) -> Callable[[], None]:
+        with warp.ScopedCapture(device=device) as capture:
+            way()
+        return partial(warp.capture_launch, capture.graph)
+
+    def advance() -> None:
+        nonlocal taken
+        ways[taken % 2]()
+        taken += 1
+
+    def places() -> Array:
+        return states[taken % 2].particle_q.numpy()[:count].astype(np.float64)
 
     reset()
-    solver.step(before, after, control, None, TIME_STEP)  # compiles
+    for way in ways:  # compiles
+        way()
+    if device == "cuda":
+        ways = [captured(way) for way in ways]
     reset()
-    path, spent = [before.particle_q.numpy()[:count].astype(np.float64)], 0.0
-    for _ in range(motion.steps):
-        begin = time.process_time()
-        solver.step(before, after, control, None, TIME_STEP)
-        spent += time.process_time() - begin
-        before, after = after, before
-        path.append(before.particle_q.numpy()[:count].astype(np.float64))
-    return Run(np.stack(path), 1e3 * spent / motion.steps)
+    return follow(advance, places, motion.steps, device)
 
 
 def surfaces_of(motion: Motion) -> tuple[Surfaces, Array]:
@@ -282,12 +309,14 @@ def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.peers.contact", description=__doc__.splitlines()[0])
     parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS))
     parser.add_argument("--penalties", type=float, nargs="*", default=PENALTIES, help="of VBD [N/m] (%(default)s)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--out", type=Path, help="output file (JSON)")
     options = parser.parse_args(words)
     torch.set_num_threads(1)
     stored = json.loads(options.out.read_text()) if options.out and options.out.exists() else {"rows": []}
     rows = {(row["motion"], row["method"], row["penalty"]): row for row in stored["rows"]}
-    run = describe_run(shlex.join(["python", "-m", "benchmarks.peers.contact", *words]), torch.device("cpu"), 1)
+    device = options.device
+    run = describe_run(shlex.join(["python", "-m", "benchmarks.peers.contact", *words]), torch.device(device), 1)
     try:
         run["versions"].update(newton_physics.versions())
         penalties = list(options.penalties)
@@ -300,11 +329,11 @@ def main(words: list[str]) -> None:
         if key in rows:
             continue
         motion = MOTIONS[name]()
-        exact = partial(ours, motion, dtype=torch.float64)
+        exact = partial(ours, motion, device=device, dtype=torch.float64)
         if penalty is None:
-            row = measure(motion, partial(ours, motion), exact, None)
+            row = measure(motion, partial(ours, motion, device=device), exact, None)
         else:
-            other = partial(vbd, motion, penalty=penalty)
+            other = partial(vbd, motion, device=device, penalty=penalty)
             row = measure(motion, other, other, exact(motion.longest).path)
         rows[key] = dict(zip(("motion", "method", "penalty"), key, strict=True)) | row
         if options.out:

@@ -209,6 +209,16 @@ def test_push_to_goal(run) -> None:
     assert end < 0.95 * distances[0]
 
 
+def test_train_pusher(run) -> None:
+    """Cubes that differ in stiffness and weight end far nearer to their goals after four steps of the optimiser."""
+    text = run("train_pusher.py", "--batch", "6", "--cells", "2", "--tries", "4")
+    assert "6 environments of 27 vertices" in text
+    left = [float(number) for number in re.findall(r"^(?: *\d+|end) +([\d.]+)", text, flags=re.MULTILINE)]
+    assert len(left) == 5
+    assert left[-1] < 0.5 * left[0]
+    numbers(text, r"memory: (\S+) GiB")
+
+
 def test_push_by_collider(run) -> None:
     text = run("push_by_collider.py", "--steps", "10", "--tries", "4")
     distances = [float(number) for number in re.findall(r"^ +\d+ +(\S+)$", text, flags=re.MULTILINE)]

@@ -143,7 +143,7 @@ def test_motions_with_contact_are_judged_by_their_own_and_crossings_are_counted(
     contact = peers("contact")
     monkeypatch.setattr(contact, "COUNTS", [4, 64])
     motion = dataclasses.replace(contact.cube_rests(), steps=4, longest=256)
-    run = functools.partial(contact.ours, motion)
+    run = functools.partial(contact.ours, motion, device="cpu")
     row = contact.measure(motion, run, functools.partial(run, dtype=torch.float64), None)
     assert row["settled"] < 1e-3
     coarse, fine = row["points"]

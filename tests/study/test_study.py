@@ -41,7 +41,8 @@ from torchpd.study.bench import (
     solved_step,
     time_calls,
 )
-from torchpd.study.plots import STYLES, draw_study, float32_floor, method_label, pareto_front
+from torchpd.study.curves import STYLES, float32_floor, method_label, pareto_front
+from torchpd.study.plots import draw_study
 from torchpd.study.results_log import Row
 from torchpd.study.scenes import STUDY_SCENES
 

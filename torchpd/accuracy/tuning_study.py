@@ -39,6 +39,7 @@ _STEPS = (0, 1, 4, 12, 30)  # of the motion, whose states are studied
 _TURNED = (0, 4)  # of these, also studied with the axes of their velocities exchanged
 _HARDEST = 2  # further states: those that are hardest to solve
 _TURN_ANGLES = (37.0, -110.0)  # [degrees] further directions of motions on rough ground
+_SPEEDS = (0.6, 1.3)  # further speeds of motions in which bodies meet, over the given one
 _ENVIRONMENTS = 3  # of a batch, besides the worst conditioned one
 # iterations that produce the studied states: of Multilevel; of Chebyshev if that does not run, or may stagnate
 _MOVING, _MOVING_PLAINLY = 64, 512
@@ -109,7 +110,7 @@ def make_study(sim: Stepper, start: AnyState, forces: Tensor | None, error: floa
     some.tolerance = 0.0
     given = None if forces is None else forces.detach()[items]
     begun = chosen(start, items)
-    states = [state for turned in (begun, *_turned_starts(some, begun)) for state in _motion(some, turned, given)]
+    states = [state for other in (begun, *_other_starts(some, begun)) for state in _motion(some, other, given)]
     everyone = _of_environments(some, list(range(len(items))) * len(states), len(items))
     state = joined(states)
     repeated = None if given is None else given.repeat(len(states), 1, 1)
@@ -150,6 +151,13 @@ def _environments(sim: Stepper, batch: int) -> list[int]:
     if ratio.dim() == 2 and len(ratio) == batch:
         items.add(int(ratio.min(dim=1).values.argmin()))
     return sorted(items)
+
+
+def _other_starts(sim: Stepper, start: AnyState) -> list[AnyState]:
+    """Starts of further motions, where what is hard to solve depends on the path: on rough ground, and of contact."""
+    met = () if sim.scene.contact is None else _SPEEDS
+    faster = [start._replace(velocities=speed * start[1]) for speed in met if bool(start[1].any())]
+    return [*_turned_starts(sim, start), *faster]
 
 
 def _turned_starts(sim: Stepper, start: AnyState) -> list[AnyState]:

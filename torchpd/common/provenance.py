@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import platform
+import shlex
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,13 @@ def describe_run(command: str, device: torch.device, threads: int) -> dict[str, 
     """Record of a run, with all that a comparison needs.
 
     Args:
-        command: reproduces the run.
+        command: reproduces the run; folders of this machine are left out of its files.
         device: device of the run.
         threads: CPU threads.
     """
     build = _C.build_info()
     return {
-        "command": command,
+        "command": shlex.join(Path(word).name if Path(word).is_absolute() else word for word in shlex.split(command)),
         "created": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
         "commit": _git_commit(),
         "machine": {

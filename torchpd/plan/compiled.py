@@ -17,7 +17,7 @@ from ..scene.solvers import Solver
 from .cpu_plan import Plan
 from .material import environments_of_material
 
-__all__ = ["CompiledScene", "persistent_tensors"]
+__all__ = ["CompiledScene", "Planned", "persistent_tensors"]
 
 
 @contextmanager
@@ -30,8 +30,29 @@ def persistent_tensors() -> Iterator[None]:
         yield
 
 
+class Planned:
+    """What has a plan, and says of it how many vertices it has, in which precision and where."""
+
+    plan: Plan
+
+    @property
+    def vertices(self) -> int:
+        """Number of vertices of all bodies."""
+        return self.plan.vertices
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of states."""
+        return self.plan.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Device of plan and states."""
+        return self.plan.device
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
-class CompiledScene:
+class CompiledScene(Planned):
     """Plan, material and settings of a scene at one time; `Simulator` documents the settings.
 
     A value: other settings make another one, by `dataclasses.replace` or `reconfigure`.
@@ -49,21 +70,6 @@ class CompiledScene:
     kernel: str
     batch: int | None
     progress: bool
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices of all bodies."""
-        return self.plan.vertices
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of states."""
-        return self.plan.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Device of states."""
-        return self.plan.device
 
     @cached_property
     def named(self) -> dict[str, Tensor]:

@@ -40,6 +40,7 @@ ONE_POINT = 1e-6  # of the distance of pins from the origin, which float32 round
 ONE_LINE = 1e-4  # of what they are apart: how far pins on one line are from it
 STILL = 1e-7  # of the size of a body: a step that ends the passes
 LAG = 1e-6  # of the friction radii: how far behind friction l a correction may leave them
+NOTHING = 1e-12  # of that size: a share of a step that moves a body by rounding
 SETTLED = 0.1  # of the motion since radii moved: a step with which they move again; of them: a lag made up at once
 FLAT = 0.5  # of the slope of Phi at the start of a step: an upward one at its end
 ROUNDING = 1e-14  # of the energy that moves a body by its size, and of that of the contacts: a rise that counts as none
@@ -317,7 +318,7 @@ def _correct_island(
             break
         share, energy = 1.0, motions.energy + contacts.energy(radius)
         rounding = ROUNDING * (motions.scale + contacts.energy(radius))
-        while left:
+        while left and share * length > NOTHING:  # else every later step ends here, too
             left -= 1
             trial = motions.after(share * step)
             there = contacts_of(trial)

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 
 from ..common.checks import check_whole
 from ..estimate.solver_choice import Choice
-from ..plan.compiled import persistent_tensors
-from ..plan.cpu_plan import Plan
+from ..plan.compiled import Planned, persistent_tensors
 from ..plan.material import CORE_ROWS, with_absent
 from ..plan.mutation_guard import MutationGuard
 from ..plan.placement import is_recording
@@ -38,11 +37,10 @@ __all__ = ["Configured"]
 _PIN_STIFFNESS = CORE_ROWS.index("pin_stiffness")
 
 
-class Configured(nn.Module):
+class Configured(Planned, nn.Module):
     """What a `Model` is set to; whatever changes plan or settings goes through `_take`."""
 
     scene: Scene
-    plan: Plan
     pinned: PinnedComponents
     choice: Choice | None  # of "auto"
     anchors: Anchors
@@ -55,21 +53,6 @@ class Configured(nn.Module):
     _adjoint: str
     _ops_names: tuple[str, ...]
     _pin_guard: MutationGuard
-
-    @property
-    def vertices(self) -> int:
-        """Number of vertices of all bodies."""
-        return self.plan.vertices
-
-    @property
-    def dtype(self) -> torch.dtype:
-        """Precision of states."""
-        return self.plan.dtype
-
-    @property
-    def device(self) -> torch.device:
-        """Device of plan and states."""
-        return self.plan.device
 
     @property
     def batch(self) -> int | None:

@@ -69,8 +69,8 @@ def check_contact(
         )
     if adjoint != "solver":
         raise ValueError(
-            f'Simulator: adjoint must be "solver" in a scene with Contact, whose steps have no gradient, got '
-            f"{adjoint!r}; leave it out"
+            f'Simulator: adjoint must be "solver" in a scene with Contact, whose gradients have a solver of their own, '
+            f"got {adjoint!r}; leave it out"
         )
     if device is not None and device.type not in ("cpu", "cuda"):
         raise RuntimeError(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.checks import optional_module
-from .plots import PALETTE, SLOPES, STYLES, TOP, axis_label, curves_of, method_label, pareto_front
+from .curves import PALETTE, SHADES, SLOPES, STYLES, TOP, axis_label, curves_of, method_label, pareto_front
 from .results_log import Row
 
 __all__ = ["write_report"]
@@ -236,7 +236,7 @@ def _stiffness_figure(rows: list[Row]) -> Any:
 
     figure = go.Figure()
     rows = [row for row in rows if row.precision == "float64"]
-    shades = dict(zip(sorted({row.youngs for row in rows}), ("#56b4e9", "#0072b2", "#002b4d"), strict=False))
+    shades = dict(zip(sorted({row.youngs for row in rows}), SHADES, strict=False))
     for (method, youngs), own in curves_of(rows, lambda row: (row.method, row.youngs)).items():
         dash = "dashed" if method == "Jacobi" else "solid"
         style = (shades.get(youngs, _OTHER[0]), 2.0, dash)

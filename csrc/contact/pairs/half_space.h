@@ -23,7 +23,6 @@ struct Ball {
 template <class T>
 struct LimitedPlace {
   Vec3<T> place;
-  bool outside;    // the target was out of the ball
   bool shortened;  // half-spaces cut the displacement
 };
 
@@ -65,7 +64,7 @@ template <class T, class Spaces>
 PD_HD LimitedPlace<T> limit(const Vec3<T>& target, const Vec3<T>& from, const Ball<T>& ball,
                             const Spaces& spaces) {
   Vec3<T> place = target;
-  const bool outside = move_into(ball, place);
+  move_into(ball, place);
   bool projected = false, moved = true;
   for (int round = 0; moved && round < projection_rounds; ++round) {
     moved = false;
@@ -76,7 +75,7 @@ PD_HD LimitedPlace<T> limit(const Vec3<T>& target, const Vec3<T>& from, const Ba
       moved = projected = true;
     });
   }
-  if (!projected) return {place, outside, false};
+  if (!projected) return {place, false};
   move_into(ball, place);
   T share(1);
   spaces([&](const Vec3<T>& normal, T bound, T margin) {
@@ -88,7 +87,7 @@ PD_HD LimitedPlace<T> limit(const Vec3<T>& target, const Vec3<T>& from, const Ba
   });
   const bool shortened = share < T(1);
   if (shortened) place = multiply_add(share, place - from, from);
-  return {place, outside, shortened};
+  return {place, shortened};
 }
 
 // Whether a place is in the ball and in all half-spaces, to their margins.

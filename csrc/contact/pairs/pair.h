@@ -188,15 +188,4 @@ PD_HD bool breaks(const ContactPair<T>& pair, const Places& target) {
   return broken;
 }
 
-// The inverse of the majoriser of a row, times c: sum |w_i| S_i / D_i. `weights`: S.
-template <class T, class Weights, class Inverse>
-PD_HD T row_bound(const ContactPair<T>& pair, const Weights& weights, const Inverse& inverse) {
-  T sum(0);
-  for (int a = 0; a < 4; ++a) {
-    const int v = pair.vertex[a];
-    sum = multiply_add(absolute(pair.near.weight[a]) * weights[v], inverse[v], sum);
-  }
-  return sum;
-}
-
 }  // namespace pd::inline PD_TARGET

@@ -162,7 +162,6 @@ class CoarseIsland {
   }
 
   PD_HD bool is_done() const { return done_; }
-  PD_HD int count() const { return count_; }
   PD_HD double renews() const { return renews_; }
   // what the next pass asks of a body
   PD_HD CoarseTrial<double> trial_of(const CoarseBody& body) const {
