@@ -320,7 +320,9 @@ def main() -> None:
     seconds = time.perf_counter() - begin
     sim.check(state)  # raises where an edge passes through a triangle, by exact signs
     plan = sim.body_contact.plan
-    print(f"{options.scene}: {len(state.positions)} environments of {len(plan.triangles)} triangles and {len(plan.edges)} edges, no crossing")
+    print(
+        f"{options.scene}: {len(state.positions)} environments of {len(plan.triangles)} triangles and {len(plan.edges)} edges, no crossing"
+    )
     print(f"{course.steps} steps in {seconds:.1f} s; pairs with a force: {int((state.history.keys >= 0).sum())}")
     print(
         f"least distance {float(info.contact_gap.min()):.2f} of the thickness; pairs that the capacity lacks: "

@@ -139,6 +139,28 @@ def test_a_rod_rests_on_a_block() -> None:
     assert float(info.contact_gap) == pytest.approx(1.0, abs=1e-6)
 
 
+@ITERATIONS
+@pytest.mark.parametrize("bend", [0.0, 1e-6, 1e-4, 1e-2])
+def test_free_rods_keep_their_momentum(bend: float, iterations: int) -> None:
+    """Linear momentum to rounding, however straight they are: a turn of a rod about itself costs no other correction."""
+    low, high = (
+        np.linspace((-0.1, 0.0, 0.0), (0.1, 0.0, 0.0), 11),
+        np.linspace((0.013, 0.03, -0.12), (0.013, 0.03, 0.1), 11),
+    )
+    bow = bend * np.sin(np.linspace(0.0, np.pi, 11))[:, None]
+    bodies = [pd.Rod(line, 1e7, RADIUS) for line in (low + bow * [0.0, 0.0, 1.0], high + bow * [1.0, 0.0, 0.0])]
+    scene = pd.Scene(*bodies, pd.Contact(friction=0.3, thickness=2.0 * RADIUS))
+    course = Course(scene, each(scene, (0.0, 0.5, 0.0), (0.2, -1.0, 0.0)))
+    sim = simulator(scene, iterations)
+    masses, first = sim.masses[:, None], course.start(sim).velocities[0]
+    touched = False
+    for state, _ in course.steps(sim, 8):
+        change = (masses * (state.velocities[0] - first)).sum(dim=0)
+        assert float(change.norm()) <= 1e-14 * float((masses * first.abs()).sum())
+        touched = touched or bool(state.history.forces.any())
+    assert touched
+
+
 @pytest.mark.parametrize("iterations", [16, 64])
 def test_a_rod_on_a_slope(iterations: int) -> None:
     """At 20 degrees it sticks with a friction of .5, and slides with .3: k h g (sin a - mu cos a), to 1e-5."""
