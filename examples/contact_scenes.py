@@ -1,8 +1,8 @@
 """Scenes of contact between bodies, by name; each ends without crossings by exact signs, and draws its course.
 
 rings: two linked rings are pulled apart.  knot: a rope is pulled into a knot.  cord: the same of a rod, pulled tight.
-pile: bodies fall into a box.  drape: a cloth falls over a ball.  fold: a cloth is folded on itself.  plates: a ball is squeezed between plates.
-batch: environments with other materials and places, side by side.
+pile: bodies fall into a box.  drape: a cloth falls over a ball.  fold: a cloth is folded on itself.
+plates: a ball is squeezed between plates.  batch: environments with other materials and places, side by side.
 """
 
 from __future__ import annotations
@@ -321,7 +321,8 @@ def main() -> None:
     sim.check(state)  # raises where an edge passes through a triangle, by exact signs
     plan = sim.body_contact.plan
     print(
-        f"{options.scene}: {len(state.positions)} environments of {len(plan.triangles)} triangles and {len(plan.edges)} edges, no crossing"
+        f"{options.scene}: {len(state.positions)} environments of {len(plan.triangles)} triangles and "
+        f"{len(plan.edges)} edges, no crossing"
     )
     print(f"{course.steps} steps in {seconds:.1f} s; pairs with a force: {int((state.history.keys >= 0).sum())}")
     print(

@@ -91,7 +91,8 @@ def test_a_coil_between_plates(iterations: int) -> None:
     course = coil()
     sim = simulator(course.scene, iterations)
     gaps = []
-    for state, info in course.steps(sim, 14):
+    for end, info in course.steps(sim, 14):
+        state = end
         gaps.append(float(info.contact_gap))
         assert int(info.contact_overflow) == 0
     assert min(gaps) >= FLOOR
@@ -142,7 +143,7 @@ def test_a_rod_rests_on_a_block() -> None:
 @ITERATIONS
 @pytest.mark.parametrize("bend", [0.0, 1e-6, 1e-4, 1e-2])
 def test_free_rods_keep_their_momentum(bend: float, iterations: int) -> None:
-    """Linear momentum to rounding, however straight they are: a turn of a rod about itself costs no other correction."""
+    """Linear momentum to rounding, however straight they are: turns about themselves cost no other correction."""
     low, high = (
         np.linspace((-0.1, 0.0, 0.0), (0.1, 0.0, 0.0), 11),
         np.linspace((0.013, 0.03, -0.12), (0.013, 0.03, 0.1), 11),

@@ -165,6 +165,27 @@ def test_surfaces_do_not_cross(name: str, iterations: int, dtype: torch.dtype) -
     assert 0.099 <= least < 20.0
 
 
+@pytest.mark.filterwarnings("ignore::torchpd.SceneWarning")
+def test_a_capacity_that_grows(dtype: torch.dtype) -> None:
+    """Steps are those with room for all pairs, to the bit."""
+    ends: list[Any] = []
+    for capacity in (5000, "grow"):
+        bodies = block(0.1, 2, (0.0, 0.05, 0.0)), block(0.1, 2, (0.013, 0.17, 0.009))
+        scene = pd.Scene(*bodies, pd.Contact(friction=0.3, thickness=THICKNESS, capacity=capacity))  # type: ignore[arg-type]
+        sim = simulator(scene, 16, dtype=dtype, device=GPU)
+        assert sim.body_contact is not None
+        if capacity == "grow":
+            sim.body_contact = sim.body_contact.with_capacity(4)
+        state: Any = sim.rest_state(3)
+        state.velocities[:, 27:, 1] = -1.0
+        ends.append(sim.rollout(state, 6).state())
+    width = ends[1].history.keys.shape[1]
+    assert 4 < width < 5000
+    assert torch.equal(ends[0].positions, ends[1].positions)
+    assert torch.equal(ends[0].history.forces[:, :width], ends[1].history.forces)
+    assert ends[1].history.forces.any()
+
+
 @pytest.mark.parametrize("iterations", [4, 16, 64])
 @pytest.mark.parametrize("speed", [1.0, 40.0])
 def test_rods_do_not_pass(speed: float, iterations: int, dtype: torch.dtype) -> None:

@@ -47,6 +47,7 @@ class ContactPlan:
     self_contact: Mask  # [Q] whether parts of a body meet
     thickness: float  # r, m
     capacity: int  # most pairs of an environment
+    grows: bool  # whether a step that needs more pairs makes them more
     vertex_tree: ContactTree  # over the rows of `vertices`
     triangle_tree: ContactTree
     edge_tree: ContactTree
@@ -131,6 +132,7 @@ def contact_plan(values: SceneValues) -> ContactPlan:
         self_contact=given.self_contact,
         thickness=thickness,
         capacity=capacity,
+        grows=given.grows,
         vertex_tree=surface.vertex_tree,
         triangle_tree=surface.triangle_tree,
         edge_tree=surface.edge_tree,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,8 +88,9 @@ class Contact(KeyPart):
 
     Surfaces rest `thickness` apart and do not cross, however few iterations a step has: docs/contact.md. The surface of
     a solid is the boundary of its mesh, whatever is embedded in it. A rod is its centre line: for rods of a radius on
-    each other, the thickness is twice the radius. Bodies that take no part pass through all others. A vertex that a `Tie` holds does not meet the triangles and edges that end at the corners of what holds it, nor do its
-    own meet those corners.
+    each other, the thickness is twice the radius. Bodies that take no part pass through all others. A vertex that a
+    `Tie` holds does not meet the triangles and edges that end at the corners of what holds it, nor do its own meet
+    those corners.
 
     Friction between two bodies is the geometric mean of their coefficients. `Contact(friction=)` is the coefficient of
     bodies, and of colliders that have none. If only one of the two has a coefficient, that is it, and without any there
@@ -104,7 +105,8 @@ class Contact(KeyPart):
             Parts of a body that rest nearer than twice that have half of their distance at rest. None: a twentieth of
             the mean edge, the least of all bodies and colliders.
         capacity: most pairs of a vertex and a triangle, or of two edges, that an environment may have near each other
-            in a step. None: 16 per triangle, and per segment of a rod.
+            in a step. None: 16 per triangle, and per segment of a rod. "grow": those, and where an environment needs
+            more, the simulator makes them more and takes the step again: eager calls alone, docs/contact.md#capacity.
 
     Example:
         >>> box = torchpd.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
@@ -119,7 +121,7 @@ class Contact(KeyPart):
     self_contact: bool | tuple[Body, ...]
     friction: float | Mapping[tuple[Member, Member], float] | None
     thickness: float | None
-    capacity: int | None
+    capacity: int | Literal["grow"] | None
 
     @check_arguments("Contact")
     def __init__(
@@ -128,7 +130,7 @@ class Contact(KeyPart):
         self_contact: bool | Sequence[Body] = True,
         friction: float | Mapping[tuple[Member, Member], float] | None = None,
         thickness: float | None = None,
-        capacity: int | None = None,
+        capacity: int | Literal["grow"] | None = None,
     ) -> None:
         for body in bodies:
             _check_member("Contact", body)
@@ -145,7 +147,7 @@ class Contact(KeyPart):
             self_contact=_self_contact(self_contact),
             friction=_friction(friction),
             thickness=thickness,
-            capacity=None if capacity is None else check_whole("Contact.capacity", capacity, minimum=1),
+            capacity=_capacity(capacity),
         )
         if bodies:
             self.check_members(bodies)
@@ -167,8 +169,8 @@ class Contact(KeyPart):
             _check_member("Contact", body)
         if not any(isinstance(body, Body) for body in members):
             raise ValueError(
-                f"Contact: bodies must have one that deforms, a Solid, a Cloth or a Rod, got {len(members)} colliders alone; "
-                "name it too"
+                f"Contact: bodies must have one that deforms, a Solid, a Cloth or a Rod, got {len(members)} colliders "
+                "alone; name it too"
             )
         known = {id(body) for body in members}
         for part in self.bodies_used():
@@ -191,6 +193,14 @@ def _check_member(name: str, body: object) -> None:
         return
     fix = "name those that take part, Contact(cloth, solid)" if isinstance(body, Body) else "pass them one by one"
     raise TypeError(f"{name} takes Solid, Cloth, Rod and Collider, got {type(body).__name__}; {fix}")
+
+
+def _capacity(value: Any) -> int | Literal["grow"] | None:
+    if value is None or (isinstance(value, str) and value == "grow"):
+        return value  # type: ignore[return-value]
+    if isinstance(value, str):
+        raise ValueError(f'Contact.capacity must be a whole number of pairs, "grow" or None, got {value!r}')
+    return check_whole("Contact.capacity", value, minimum=1)
 
 
 def _self_contact(value: Any) -> bool | tuple[Body, ...]:
@@ -246,6 +256,7 @@ class ContactValues:
     self_contact: Mask  # [Q] whether parts of a body meet
     thickness: float | None  # m; None: by the mesh
     capacity: int | None  # pairs of an environment; None: by the mesh
+    grows: bool  # whether a step that needs more pairs makes them more
     kinds: tuple[str, ...]  # [Q] kinds of the bodies, for errors
 
 
@@ -267,7 +278,8 @@ def contact_values(contact: Contact, bodies: Sequence[Body], colliders: Sequence
         friction=_table(contact, parts),
         self_contact=np.array(selves),
         thickness=contact.thickness,
-        capacity=contact.capacity,
+        capacity=contact.capacity if isinstance(contact.capacity, int) else None,
+        grows=contact.capacity == "grow",
         kinds=tuple(type(part).__name__ for part in parts),
     )
 
