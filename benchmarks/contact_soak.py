@@ -1,9 +1,10 @@
 """Random scenes of bodies in contact: whether anything crosses, ends as NaN, or comes nearer than the promise.
 
-Boxes, a sheet of cloth and a collider of random sizes and stiffness fly at each other with up to 40 m/s, in steps of
-1/1000 to 1/30 s. Surfaces rest 0.1 to 4 mm apart; friction is 0, 0.3 or 1. A scene takes 4, 16 or 64 iterations in
-float32 or float64, and enough steps to meet. Every end of a step is checked by exact signs. Measured scenes are kept:
-an interrupted run resumes.
+Boxes, rods, a sheet of cloth and a collider of random sizes and stiffness fly at each other with up to 40 m/s, in
+steps of 1/1000 to 1/30 s. Surfaces rest 0.1 to 4 mm apart; friction is 0, 0.3 or 1. A scene takes 4, 16 or 64
+iterations in float32 or float64, and enough steps to meet. Every end of a step is checked by exact signs. Rods that
+pass through rods cross nothing: the least distance is all that is checked of them. Measured scenes are kept: an
+interrupted run resumes.
 
     python benchmarks/contact_soak.py --scenes 2000
 
@@ -53,15 +54,26 @@ def random_sheet(rng: np.random.Generator, place: np.ndarray) -> pd.TriMesh:
     return pd.TriMesh(Rotation.random(rng=rng).apply(points.reshape(-1, 3)) + place, triangles)
 
 
+def random_rod(rng: np.random.Generator, place: np.ndarray, youngs: float) -> pd.Rod:
+    """A rod of 1 to 12 segments, straight or an arc."""
+    segments, length, arc = int(rng.integers(1, 13)), float(rng.uniform(0.08, 0.2)), float(rng.choice([0.0, 1.0, 3.0]))
+    angle = arc * np.linspace(-0.5, 0.5, segments + 1)
+    along = np.linspace(-0.5, 0.5, segments + 1) if arc == 0.0 else np.sin(angle) / arc
+    line = length * np.stack([along, (1.0 - np.cos(angle)) / max(arc, 1.0), 0.0 * angle], axis=1)
+    return pd.Rod(Rotation.random(rng=rng).apply(line) + place, youngs, radius=float(rng.uniform(1e-3, 4e-3)))
+
+
 def random_scene(rng: np.random.Generator) -> tuple[Row, pd.Simulator, Any, dict[Any, torch.Tensor]]:
     """The random parameters, the simulator, the first state, and where the collider goes in a step."""
     places = 0.28 * np.array([(i, j, k) for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)])
     places = places[rng.permutation(len(places))]
     youngs, friction = 10.0 ** rng.uniform(4.0, 7.0), float(rng.choice([0.0, 0.3, 1.0]))
-    parts: list[Any] = [pd.Solid(random_box(rng, place), youngs) for place in places[: rng.integers(1, 4)]]
-    if rng.random() < 0.5:
+    parts: list[Any] = [pd.Solid(random_box(rng, place), youngs) for place in places[: rng.integers(0, 4)]]
+    if rng.random() < 0.5 or not parts:
         sheet = random_sheet(rng, places[4])
         parts.append(pd.Cloth(sheet, youngs, thickness=1e-3, area_density=0.3))
+    lines = int(rng.integers(0, 3))
+    parts += [random_rod(rng, place, youngs) for place in places[len(places) - lines :]]
     speed = float(10.0 ** rng.uniform(-0.5, 1.6))
     collider = None
     if rng.random() < 0.5 or len(parts) == 1:
@@ -90,7 +102,7 @@ def random_scene(rng: np.random.Generator) -> tuple[Row, pd.Simulator, Any, dict
     if collider is not None:
         place = np.concatenate([rng.normal(0.0, 0.03, 3), Rotation.random(rng=rng).as_quat()[[3, 0, 1, 2]]])
         targets = {collider: torch.tensor(place, dtype=sim.dtype)}
-    facts = {"bodies": len(parts), "collider": collider is not None, "youngs": youngs, "speed": speed}
+    facts = {"bodies": len(parts), "rods": lines, "collider": collider is not None, "youngs": youngs, "speed": speed}
     facts |= {"thickness": thickness, "friction": friction, "time_step": sim.time_step}
     return facts | {"iterations": sim.iterations, "dtype": str(sim.dtype)}, sim, state, targets
 

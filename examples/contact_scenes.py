@@ -1,8 +1,8 @@
 """Scenes of contact between bodies, by name; each ends without crossings by exact signs, and draws its course.
 
-rings: two linked rings are pulled apart.  knot: a rope is pulled into a knot.  pile: bodies fall into a box.
-drape: a cloth falls over a ball.  fold: a cloth is folded on itself.  plates: a ball is squeezed between plates.
-batch: environments with other materials and places, side by side.
+rings: two linked rings are pulled apart.  knot: a rope is pulled into a knot.  cord: the same of a rod, pulled tight.
+pile: bodies fall into a box.  drape: a cloth falls over a ball.  fold: a cloth is folded on itself.
+plates: a ball is squeezed between plates.  batch: environments with other materials and places, side by side.
 """
 
 from __future__ import annotations
@@ -109,14 +109,19 @@ def rings(steps: int) -> Course:
     return Course(sim, steps, targets, elevation=35.0)
 
 
-def knot(steps: int) -> Course:
-    """A rope of 1.7 cm lies in an overhand knot; its ends are pulled apart."""
+def overhand(cells: int) -> np.ndarray:
+    """Vertices [cells + 1, 3] m of a line of even segments in an overhand knot."""
     t = np.linspace(-2.1, 2.1, 400)
     curve = np.stack([t**3 - 3.0 * t, 0.8 * (t**4 - 4.0 * t**2), 0.2 * (t**5 - 10.0 * t)], axis=1) * 0.1
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    cells = 140
     places = np.linspace(0.0, length[-1], cells + 1)
-    line = np.stack([np.interp(places, length, curve[:, axis]) for axis in range(3)], axis=1) + [0.0, 0.4, 0.0]
+    return np.stack([np.interp(places, length, curve[:, axis]) for axis in range(3)], axis=1) + [0.0, 0.4, 0.0]
+
+
+def knot(steps: int) -> Course:
+    """A rope of 1.7 cm lies in an overhand knot; its ends are pulled apart."""
+    cells = 140
+    line = overhand(cells)
     mesh = bent(tpd.shapes.box((1.0, 0.017, 0.017), (cells, 1, 1)), line)
     rope = tpd.Solid(mesh, youngs=3e5, density=1000.0)
     ends = [tpd.Pin(rope, np.linalg.norm(mesh.vertices - end, axis=1) < 0.015) for end in (line[0], line[-1])]
@@ -127,6 +132,22 @@ def knot(steps: int) -> Course:
     def targets(step: int) -> dict[Any, torch.Tensor]:
         share = ramp(step, 0, max(steps * 9 // 10, 1))
         ways = torch.tensor([[-0.9, 0.0, -line[0, 2]], [0.9, 0.0, -line[-1, 2]]]) * share
+        return {pin: start + way.to(start) for pin, start, way in zip(ends, starts, ways, strict=True)}
+
+    return Course(sim, steps, targets, azimuth=0.0, size=(740, 240), columns=2)
+
+
+def cord(steps: int) -> Course:
+    """A rod of 2.4 cm lies in an overhand knot, which is pulled tight."""
+    line, radius = overhand(140), 0.012
+    rope = tpd.Rod(line, youngs=2e5, radius=radius, rest_curvature=0.0)
+    ends = [tpd.Pin(rope, vertices) for vertices in ([0, 1], [139, 140])]
+    sim = simulator(rope, *ends, tpd.Contact(friction=0.2, thickness=2.0 * radius), tpd.Damping(2.0), iterations=64)
+    starts = [pinned(sim, pin) for pin in ends]
+
+    def targets(step: int) -> dict[Any, torch.Tensor]:
+        share = ramp(step, 0, max(steps * 9 // 10, 1))
+        ways = torch.tensor([[-0.85, 0.0, -line[0, 2]], [0.85, 0.0, -line[-1, 2]]]) * share
         return {pin: start + way.to(start) for pin, start, way in zip(ends, starts, ways, strict=True)}
 
     return Course(sim, steps, targets, azimuth=0.0, size=(740, 240), columns=2)
@@ -223,6 +244,7 @@ def batch(steps: int, environments: int = 256) -> Course:
 SCENES: dict[str, tuple[Callable[[int], Course], int]] = {
     "rings": (rings, 60),
     "knot": (knot, 110),
+    "cord": (cord, 90),
     "pile": (pile, 60),
     "drape": (drape, 60),
     "fold": (fold, 60),
@@ -298,7 +320,10 @@ def main() -> None:
     seconds = time.perf_counter() - begin
     sim.check(state)  # raises where an edge passes through a triangle, by exact signs
     plan = sim.body_contact.plan
-    print(f"{options.scene}: {len(state.positions)} environments of {len(plan.triangles)} triangles, no crossing")
+    print(
+        f"{options.scene}: {len(state.positions)} environments of {len(plan.triangles)} triangles and "
+        f"{len(plan.edges)} edges, no crossing"
+    )
     print(f"{course.steps} steps in {seconds:.1f} s; pairs with a force: {int((state.history.keys >= 0).sum())}")
     print(
         f"least distance {float(info.contact_gap.min()):.2f} of the thickness; pairs that the capacity lacks: "

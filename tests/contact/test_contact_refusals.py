@@ -219,8 +219,9 @@ def test_the_residual_falls_to_zero() -> None:
 
 def test_print_tells_thickness_and_capacity() -> None:
     text = str(SIM)
-    count, capacity = (getattr(SIM.body_contact.plan, name) for name in ("triangles", "capacity"))  # type: ignore[union-attr]
-    assert f"contact: 1 bodies, 2 colliders ({len(count)} triangles), thickness 0.001 m, up to {capacity} pairs" in text
+    plan: Any = SIM.body_contact.plan  # type: ignore[union-attr]
+    assert f"contact: 1 bodies, 2 colliders ({len(plan.triangles)} triangles, {len(plan.edges)} edges)" in text
+    assert f"thickness 0.001 m, up to {plan.capacity} pairs in each environment" in text
     small, large = (
         simulator(pd.Scene(block(0.1, 1, (0.0, 0.0, 0.0)), pd.Contact(capacity=count))) for count in (10, 1010)
     )

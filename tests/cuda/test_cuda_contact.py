@@ -29,6 +29,7 @@ from body_scenes import (
 from cases import rotation
 from devices import require_gpu
 from on_gpu import GPU, host_waits
+from rod_scenes import crossed_rods, passages, rod_on_cloth
 from runs import noise
 from torch import Tensor
 
@@ -43,6 +44,8 @@ _COURSES: dict[str, tuple[Callable[[], Course], int]] = {
     "plates": (lambda: plates(-0.002)[0], 24),
     "gripper": (lambda: gripper(0.8), 24),
     "folded sheet": (lambda: folded_sheet(self_contact=True), 12),
+    "rods that cross": (lambda: crossed_rods(10.0), 8),
+    "rod on a sheet": (rod_on_cloth, 8),
 }
 
 
@@ -162,7 +165,38 @@ def test_surfaces_do_not_cross(name: str, iterations: int, dtype: torch.dtype) -
     assert 0.099 <= least < 20.0
 
 
-@pytest.mark.parametrize("name", ["two cubes", "gripper", "ball on a sheet"])
+@pytest.mark.filterwarnings("ignore::torchpd.SceneWarning")
+def test_a_capacity_that_grows(dtype: torch.dtype) -> None:
+    """Steps are those with room for all pairs, to the bit."""
+    ends: list[Any] = []
+    for capacity in (5000, "grow"):
+        bodies = block(0.1, 2, (0.0, 0.05, 0.0)), block(0.1, 2, (0.013, 0.17, 0.009))
+        scene = pd.Scene(*bodies, pd.Contact(friction=0.3, thickness=THICKNESS, capacity=capacity))  # type: ignore[arg-type]
+        sim = simulator(scene, 16, dtype=dtype, device=GPU)
+        assert sim.body_contact is not None
+        if capacity == "grow":
+            sim.body_contact = sim.body_contact.with_capacity(4)
+        state: Any = sim.rest_state(3)
+        state.velocities[:, 27:, 1] = -1.0
+        ends.append(sim.rollout(state, 6).state())
+    width = ends[1].history.keys.shape[1]
+    assert 4 < width < 5000
+    assert torch.equal(ends[0].positions, ends[1].positions)
+    assert torch.equal(ends[0].history.forces[:, :width], ends[1].history.forces)
+    assert ends[1].history.forces.any()
+
+
+@pytest.mark.parametrize("iterations", [4, 16, 64])
+@pytest.mark.parametrize("speed", [1.0, 40.0])
+def test_rods_do_not_pass(speed: float, iterations: int, dtype: torch.dtype) -> None:
+    course = crossed_rods(speed)
+    sim = on_gpu(course, iterations, dtype)
+    for state, info in course.steps(sim, 12):
+        assert passages(state.positions[0].double().cpu().numpy()) == 0
+        assert float(info.contact_gap) >= 0.099
+
+
+@pytest.mark.parametrize("name", ["two cubes", "gripper", "ball on a sheet", "rods that cross"])
 @pytest.mark.parametrize("tolerance", [0.0, 1e-2])
 def test_runs_and_batches_do_not_matter(name: str, tolerance: float, dtype: torch.dtype) -> None:
     """300 environments of other velocities, after steps in which most of them touch: each as alone, and every time."""

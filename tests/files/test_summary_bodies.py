@@ -49,5 +49,5 @@ def test_contact_is_listed_with_its_bodies() -> None:
     solid = pd.Solid(pd.shapes.box((1, 1, 1), (1, 1, 1)).translated((0, 2, 0)), 1e5)
     table = pd.Collider(pd.shapes.box((1, 1, 1), (1, 1, 1)).translated((0, -3, 0)))
     text = str(pd.Simulator(pd.Scene(solid, cloth(), table, pd.Contact(solid, table))))
-    assert "contact: 1 bodies, 1 colliders (24 triangles)" in text
+    assert "contact: 1 bodies, 1 colliders (24 triangles, 36 edges)" in text
     assert "contact" not in str(pd.Simulator(pd.Scene(solid, cloth())))

@@ -293,14 +293,14 @@ def test_lift_cube(run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert abs(lifted) < 1e-3
 
 
-@pytest.mark.parametrize("scene", ["rings", "knot", "pile", "drape", "fold", "plates", "batch"])
+@pytest.mark.parametrize("scene", ["rings", "knot", "cord", "pile", "drape", "fold", "plates", "batch"])
 def test_contact_scenes(run, monkeypatch: pytest.MonkeyPatch, scene: str) -> None:
     """Each starts and ends without crossings, its whole motion within four steps; one is drawn."""
     studio = viewing.Studio
     monkeypatch.setattr(viewing, "Studio", lambda *a, **more: studio(*a, **{**more, "size": (48, 36), "samples": 1}))
     out = ("--out", "rings.png", "--frames", "2") if scene == "rings" else ()
     text = run("contact_scenes.py", "--scene", scene, "--steps", "4", *out)
-    environments, _ = numbers(text, rf"{scene}: (\d+) environments of (\d+) triangles, no crossing")
+    environments, *_ = numbers(text, rf"{scene}: (\d+) environments of (\d+) triangles and (\d+) edges, no crossing")
     assert environments == (256 if scene == "batch" else 1)
     assert numbers(text, r"capacity lacks: (\d+)") == [0.0]
     if out:

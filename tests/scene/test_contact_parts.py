@@ -57,10 +57,10 @@ def friction_of(contact: pd.Contact, *others: Any) -> list[list[float]]:
         (
             lambda: pd.Contact("all"),
             TypeError,
-            "Contact takes Solid, Cloth and Collider, got str; pass them one by one",
+            "Contact takes Solid, Cloth, Rod and Collider, got str; pass them one by one",
         ),
         (lambda: pd.Contact([SOLID]), TypeError, "Contact takes Solid, .*got list; pass them one by one"),
-        (lambda: pd.Contact(SOLID, ROD), TypeError, r"Contact takes Solid, .*got Rod; name those .*Contact\(cloth"),
+        (lambda: pd.Contact(SOLID, pd.Ground()), TypeError, "Contact takes Solid, .*got Ground; pass them one by one"),
         (lambda: pd.Contact(SOLID, SOLID), ValueError, "each body must be given once, got the same Solid twice"),
         (lambda: pd.Contact(FLOOR), ValueError, "bodies must have one that deforms, .*got 1 colliders alone; name it"),
         (lambda: pd.Contact(thickness=0.0), ValueError, r"Contact\.thickness must be positive \[m\], got 0\.0; None"),
@@ -72,7 +72,7 @@ def friction_of(contact: pd.Contact, *others: Any) -> list[list[float]]:
             TypeError,
             r"self_contact must be a bool or a list .*got Cloth; .*\[b",
         ),
-        (lambda: pd.Contact(self_contact=[ROD]), TypeError, r"Contact\.self_contact takes Solid, .*got Rod"),
+        (lambda: pd.Contact(self_contact=["rod"]), TypeError, r"Contact\.self_contact takes Solid, .*Rod .*got str"),
         (
             lambda: pd.Contact(self_contact=[FLOOR]),
             TypeError,
@@ -89,7 +89,7 @@ def friction_of(contact: pd.Contact, *others: Any) -> list[list[float]]:
             TypeError,
             r"friction must have pairs .*got Solid; \{\(cloth, table",
         ),
-        (lambda: pd.Contact(friction={(SOLID, ROD): 0.3}), TypeError, r"Contact\.friction takes Solid, .*got Rod"),
+        (lambda: pd.Contact(friction={(SOLID, 0): 0.3}), TypeError, r"Contact\.friction takes Solid, .*got int"),
         (
             lambda: pd.Contact(friction={(SOLID, SHEET): -0.3}),
             ValueError,
@@ -131,7 +131,6 @@ def test_parts_are_checked(make: Callable[[], object], kind: type[Exception], me
         ((SOLID, pd.Contact(SHEET)), ValueError, "the body of a Contact must be a part of this scene, got another one"),
         ((SOLID, pd.Contact(SOLID, FLOOR)), ValueError, "the body of a Contact must be a part of this scene"),
         ((SOLID, pd.Contact(self_contact=[SHEET])), ValueError, "the body of a Contact must be a part of this scene"),
-        ((SOLID, ROD, pd.Contact()), TypeError, "Contact takes Solid, Cloth and Collider, got Rod; name those"),
         ((FLOOR, pd.Contact()), ValueError, "Scene needs at least one body, got none"),
         ((SOLID, FLOOR, FLOOR, pd.Contact()), ValueError, "got the same Collider twice"),
         ((SOLID, FLOOR, pd.Contact(friction={(FLOOR, FLOOR): 1.0})), ValueError, "must name pairs that can touch"),
@@ -147,7 +146,7 @@ def test_patches_are_refused_by_name() -> None:
     ball = pd.shapes.octopus(cells=16)
     patches = pd.PatchBody(pd.FreeFormPatches.from_mesh(ball), 1e5, apex="prism")
     for make in (lambda: pd.Contact(patches), lambda: pd.Scene(patches, pd.Contact())):
-        with pytest.raises(TypeError, match="Contact takes Solid, Cloth and Collider, got PatchBody; name those"):
+        with pytest.raises(TypeError, match="Contact takes Solid, Cloth, Rod and Collider, got PatchBody; name those"):
             make()
     assert pd.Scene(patches, SHEET, pd.Contact(SHEET)).contact is not None
 
@@ -238,6 +237,11 @@ def test_numbers_are_those_of_the_scene() -> None:
     np.testing.assert_array_equal(values.triangles[: len(boundary)], boundary)
     np.testing.assert_array_equal(values.triangles[len(boundary) : -2], surface().triangles + 31)
     np.testing.assert_array_equal(values.triangles[-2:], TRIANGLE.triangles + [[own], [own + 3]])
+    assert not len(values.segments)
+    with_rod = pd.Scene(SOLID, ROD, SHEET, pd.Contact(ROD, SHEET)).values().contact
+    assert with_rod is not None
+    assert with_rod.segments.tolist() == [[27, 28], [28, 29], [29, 30]]
+    np.testing.assert_array_equal(with_rod.triangles, surface().triangles + 31)
 
 
 def test_the_rest_of_a_scene_does_not_know_contact() -> None:

@@ -24,6 +24,7 @@ from body_scenes import (
     slope,
     two_cubes,
 )
+from rod_scenes import rod_on_cloth
 from torch import Tensor
 
 import torchpd as pd
@@ -34,6 +35,7 @@ _COURSES = {
     "plates": (lambda: plates(-0.002)[0], 24),
     "gripper": (lambda: gripper(0.8), 24),
     "folded sheet": (lambda: folded_sheet(self_contact=True), 12),
+    "rod on a sheet": (rod_on_cloth, 10),
 }
 
 

@@ -134,10 +134,11 @@ def _effect_lines(sim: Stepper) -> list[str]:
         lines.append(f"spheres: {len(scene.spheres)}, one projection per vertex and iteration each")
     if sim.body_contact is not None:
         plan = sim.body_contact.plan
-        rigid, taking = len(plan.poses), len(np.unique(plan.body[plan.triangles[:, 0]]))
+        rigid, taking = len(plan.poses), len(np.unique(plan.body[plan.edges[:, 0]]))
         lines.append(
-            f"contact: {taking - rigid} bodies, {rigid} colliders ({len(plan.triangles)} triangles), thickness "
-            f"{plan.thickness:.3g} m, up to {plan.capacity} pairs in each environment"
+            f"contact: {taking - rigid} bodies, {rigid} colliders ({len(plan.triangles)} triangles, "
+            f"{len(plan.edges)} edges), thickness {plan.thickness:.3g} m, up to {plan.capacity} pairs in each "
+            f"environment{', more when needed' if plan.grows else ''}"
         )
     return lines
 

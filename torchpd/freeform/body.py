@@ -65,7 +65,7 @@ class PatchBody(Solid):
     patch_of: Index  # [E] patch of each constraint, -1 between apexes
     transport: PatchTransport
     _layer: _Layer | None
-    has_triangles = False  # its surface is that of the patches
+    has_surface = False  # its surface is that of the patches
 
     def __init__(
         self,

@@ -20,23 +20,23 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Primitives:
-    """Surfaces of the bodies that take part, among N vertices, and trees over their primitives."""
+    """Surfaces and rods of the bodies that take part, among N vertices, and trees over their primitives."""
 
     rest: Array  # [N, 3] m
     body: Index  # [N]
-    vertices: Index  # [S] corners of the triangles, increasing
+    vertices: Index  # [S] ends of the edges, increasing
     triangles: Index  # [T, 3]
-    edges: Index  # [E, 2] of the triangles, each once, the lower vertex first, in increasing order
+    edges: Index  # [E, 2] of the triangles and rods, each once, the lower vertex first, in increasing order
     vertex_tree: ContactTree  # over the rows of `vertices`
     triangle_tree: ContactTree
     edge_tree: ContactTree
 
     @staticmethod
-    def of(rest: Array, body: Index, triangles: Index) -> Primitives:
-        """Vertices and edges of triangles [T, 3], with trees."""
-        sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    def of(rest: Array, body: Index, triangles: Index, segments: Index) -> Primitives:
+        """Vertices and edges of triangles [T, 3] and segments of rods [n, 2], with trees."""
+        sides = np.sort(np.concatenate([triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), segments]), axis=1)
         edges = np.stack(np.divmod(np.unique(sides[:, 0] * len(rest) + sides[:, 1]), len(rest)), axis=1)
-        vertices = np.unique(triangles)
+        vertices = np.unique(edges)
         trees = [contact_tree(rest[of].mean(axis=1), body[of[:, 0]]) for of in (vertices[:, None], triangles, edges)]
         return Primitives(rest, body, vertices, triangles, edges, *trees)
 

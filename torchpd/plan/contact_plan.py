@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 FLOOR = 0.1  # least distance that is promised, over the thickness
 _EDGES_PER_THICKNESS = 20.0
-_PAIRS_PER_TRIANGLE = 16  # two layers that lie on each other have 11
+_PAIRS_PER_PART = 16  # a triangle or a segment of a rod: two layers that lie on each other have 11
 _APART = 0.7  # of the mean edge: a search in a step reaches over half of it
 
 
@@ -35,8 +35,8 @@ class ContactPlan:
 
     rest: Array  # [N, 3] m, colliders at their first poses
     triangles: Numbers  # [T, 3] of the bodies that take part
-    edges: Numbers  # [E, 2] each once, in increasing order
-    vertices: Numbers  # [S] corners of the triangles, increasing
+    edges: Numbers  # [E, 2] of triangles and rods, each once, in increasing order
+    vertices: Numbers  # [S] ends of the edges, increasing
     body: Numbers  # [N] number of the body of each vertex
     kinematic: Mask  # [N] whether the scene moves the vertex by hand: hard pins and colliders
     collider: Numbers  # [N] number of its collider, -1 for vertices that deform
@@ -47,6 +47,7 @@ class ContactPlan:
     self_contact: Mask  # [Q] whether parts of a body meet
     thickness: float  # r, m
     capacity: int  # most pairs of an environment
+    grows: bool  # whether a step that needs more pairs makes them more
     vertex_tree: ContactTree  # over the rows of `vertices`
     triangle_tree: ContactTree
     edge_tree: ContactTree
@@ -104,12 +105,14 @@ def contact_plan(values: SceneValues) -> ContactPlan:
         raise ValueError("contact_plan: values must be of a scene with Contact, got one without; add Contact()")
     own, bodies = len(values.rest_positions), len(given.kinds)
     world = placed(given.poses[given.collider[own:]], given.points)
-    surface = Primitives.of(np.concatenate([values.rest_positions, world]), given.body, given.triangles)
+    surface = Primitives.of(np.concatenate([values.rest_positions, world]), given.body, given.triangles, given.segments)
     lengths, of = surface.edge_lengths, given.body[surface.edges[:, 0]]
     counts = np.bincount(of, minlength=bodies)
     mean = np.bincount(of, weights=lengths, minlength=bodies) / np.maximum(counts, 1)
     thickness = float(mean[counts > 0].min()) / _EDGES_PER_THICKNESS if given.thickness is None else given.thickness
     _check_triangles(given, surface, thickness)
+    parts = len(given.triangles) + len(given.segments)
+    capacity = _PAIRS_PER_PART * parts if given.capacity is None else given.capacity
     kinematic = given.collider >= 0
     kinematic[values.pin_vertices[np.isinf(values.pin_stiffness)]] = True
     tied = _tied(values)
@@ -128,7 +131,8 @@ def contact_plan(values: SceneValues) -> ContactPlan:
         friction=given.friction,
         self_contact=given.self_contact,
         thickness=thickness,
-        capacity=_PAIRS_PER_TRIANGLE * len(surface.triangles) if given.capacity is None else given.capacity,
+        capacity=capacity,
+        grows=given.grows,
         vertex_tree=surface.vertex_tree,
         triangle_tree=surface.triangle_tree,
         edge_tree=surface.edge_tree,
@@ -152,9 +156,9 @@ def _check_triangles(given: ContactValues, surface: Primitives, thickness: float
     area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
     longest = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=2).max(axis=1)
     altitude = np.divide(area, longest, out=np.zeros_like(area), where=longest > 0.0)
-    flattest = int(altitude.argmin())
-    if thickness <= 0.5 * altitude[flattest]:
+    if thickness <= 0.5 * altitude.min(initial=np.inf):
         return
+    flattest = int(altitude.argmin())
     corners = surface.triangles[flattest].tolist()
     where = f"a triangle, {own_vertices(given.body, corners)} ({given.kinds[given.body[corners[0]]]})"
     if altitude[flattest] == 0.0:

@@ -41,7 +41,7 @@ def contact_tree(centroids: Array, body: Index) -> ContactTree:
 
 def _morton(points: Array, body: Index) -> NDArray[np.uint64]:
     """Interleaved bits of the coordinates of each point [n] in the cube around its body."""
-    count = int(body.max()) + 1
+    count = int(body.max(initial=-1)) + 1
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, body, points)
     np.maximum.at(high, body, points)
@@ -86,6 +86,8 @@ class Boxes:
 def meeting(one: Boxes, other: Boxes) -> tuple[Index, Index]:
     """Numbers [m] and [m] of the primitives of two trees whose boxes meet; each pair once where the trees are one."""
     same = one is other
+    if not len(one.order) or not len(other.order):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     first = second = np.zeros(1, dtype=np.int64)
     level, beside = len(one.low) - 1, len(other.low) - 1
     while level or beside:

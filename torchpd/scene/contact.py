@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from ..common.synonyms import check_arguments
 from ..geometry.tet_mesh import TetMesh
 from ..geometry.tri_mesh import TriMesh
 from .part import ArrayLike, Body, KeyPart, set_fields, unit_vectors
+from .rod import Polyline
 
 __all__ = ["Collider", "Contact", "ContactValues", "contact_values", "placed"]
 
@@ -83,19 +84,20 @@ Member: TypeAlias = Body | Collider
 
 @dataclass(eq=False, repr=False)
 class Contact(KeyPart):
-    """Keeps surfaces of triangles apart: those of bodies, of colliders, and of each body with itself.
+    """Keeps surfaces and rods apart: those of bodies, of colliders, and of each body with itself.
 
     Surfaces rest `thickness` apart and do not cross, however few iterations a step has: docs/contact.md. The surface of
-    a solid is the boundary of its mesh, whatever is embedded in it. Bodies that take no part pass through all others. A
-    vertex that a `Tie` holds does not meet the triangles and edges that end at the corners of what holds it, nor do its
-    own meet those corners.
+    a solid is the boundary of its mesh, whatever is embedded in it. A rod is its centre line: for rods of a radius on
+    each other, the thickness is twice the radius. Bodies that take no part pass through all others. A vertex that a
+    `Tie` holds does not meet the triangles and edges that end at the corners of what holds it, nor do its own meet
+    those corners.
 
     Friction between two bodies is the geometric mean of their coefficients. `Contact(friction=)` is the coefficient of
     bodies, and of colliders that have none. If only one of the two has a coefficient, that is it, and without any there
     is no friction.
 
     Args:
-        bodies: each a `Solid`, a `Cloth` or a `Collider`; all of the scene if none is named.
+        bodies: each a `Solid`, a `Cloth`, a `Rod` or a `Collider`; all of the scene if none is named.
         self_contact: whether bodies touch themselves, or a list of those that do.
         friction: Coulomb's coefficient, >= 0; or by pairs of bodies, {(cloth, table): 0.3}, where other pairs are as
             without it; or None.
@@ -103,7 +105,8 @@ class Contact(KeyPart):
             Parts of a body that rest nearer than twice that have half of their distance at rest. None: a twentieth of
             the mean edge, the least of all bodies and colliders.
         capacity: most pairs of a vertex and a triangle, or of two edges, that an environment may have near each other
-            in a step. None: 16 per triangle.
+            in a step. None: 16 per triangle, and per segment of a rod. "grow": those, and where an environment needs
+            more, the simulator makes them more and takes the step again: eager calls alone, docs/contact.md#capacity.
 
     Example:
         >>> box = torchpd.shapes.box((0.1, 0.1, 0.1), (2, 2, 2))
@@ -118,7 +121,7 @@ class Contact(KeyPart):
     self_contact: bool | tuple[Body, ...]
     friction: float | Mapping[tuple[Member, Member], float] | None
     thickness: float | None
-    capacity: int | None
+    capacity: int | Literal["grow"] | None
 
     @check_arguments("Contact")
     def __init__(
@@ -127,7 +130,7 @@ class Contact(KeyPart):
         self_contact: bool | Sequence[Body] = True,
         friction: float | Mapping[tuple[Member, Member], float] | None = None,
         thickness: float | None = None,
-        capacity: int | None = None,
+        capacity: int | Literal["grow"] | None = None,
     ) -> None:
         for body in bodies:
             _check_member("Contact", body)
@@ -144,7 +147,7 @@ class Contact(KeyPart):
             self_contact=_self_contact(self_contact),
             friction=_friction(friction),
             thickness=thickness,
-            capacity=None if capacity is None else check_whole("Contact.capacity", capacity, minimum=1),
+            capacity=_capacity(capacity),
         )
         if bodies:
             self.check_members(bodies)
@@ -166,8 +169,8 @@ class Contact(KeyPart):
             _check_member("Contact", body)
         if not any(isinstance(body, Body) for body in members):
             raise ValueError(
-                f"Contact: bodies must have one that deforms, a Solid or a Cloth, got {len(members)} colliders alone; "
-                "name it too"
+                f"Contact: bodies must have one that deforms, a Solid, a Cloth or a Rod, got {len(members)} colliders "
+                "alone; name it too"
             )
         known = {id(body) for body in members}
         for part in self.bodies_used():
@@ -186,10 +189,18 @@ class Contact(KeyPart):
 
 
 def _check_member(name: str, body: object) -> None:
-    if isinstance(body, Collider) or (isinstance(body, Body) and body.has_triangles):
+    if isinstance(body, Collider) or (isinstance(body, Body) and body.has_surface):
         return
     fix = "name those that take part, Contact(cloth, solid)" if isinstance(body, Body) else "pass them one by one"
-    raise TypeError(f"{name} takes Solid, Cloth and Collider, got {type(body).__name__}; {fix}")
+    raise TypeError(f"{name} takes Solid, Cloth, Rod and Collider, got {type(body).__name__}; {fix}")
+
+
+def _capacity(value: Any) -> int | Literal["grow"] | None:
+    if value is None or (isinstance(value, str) and value == "grow"):
+        return value  # type: ignore[return-value]
+    if isinstance(value, str):
+        raise ValueError(f'Contact.capacity must be a whole number of pairs, "grow" or None, got {value!r}')
+    return check_whole("Contact.capacity", value, minimum=1)
 
 
 def _self_contact(value: Any) -> bool | tuple[Body, ...]:
@@ -236,6 +247,7 @@ class ContactValues:
     """
 
     triangles: Index  # [T, 3] surfaces of the bodies that take part
+    segments: Index  # [n, 2] of the rods that take part
     body: Index  # [N] number of the body of each vertex
     collider: Index  # [N] number of its collider, -1 for vertices that deform
     points: Array  # [N - V, 3] m, vertices of colliders about the origins of their poses
@@ -244,6 +256,7 @@ class ContactValues:
     self_contact: Mask  # [Q] whether parts of a body meet
     thickness: float | None  # m; None: by the mesh
     capacity: int | None  # pairs of an environment; None: by the mesh
+    grows: bool  # whether a step that needs more pairs makes them more
     kinds: tuple[str, ...]  # [Q] kinds of the bodies, for errors
 
 
@@ -257,6 +270,7 @@ def contact_values(contact: Contact, bodies: Sequence[Body], colliders: Sequence
     body = np.repeat(np.arange(len(parts)), counts)
     return ContactValues(
         triangles=np.concatenate([_triangles(parts[number]) + starts[number] for number in np.flatnonzero(taking)]),
+        segments=np.concatenate([_segments(parts[number]) + starts[number] for number in np.flatnonzero(taking)]),
         body=body,
         collider=np.where(body < len(bodies), -1, body - len(bodies)),
         points=np.concatenate([np.zeros((0, 3)), *(part.mesh.vertices for part in colliders)]),
@@ -264,15 +278,22 @@ def contact_values(contact: Contact, bodies: Sequence[Body], colliders: Sequence
         friction=_table(contact, parts),
         self_contact=np.array(selves),
         thickness=contact.thickness,
-        capacity=contact.capacity,
+        capacity=contact.capacity if isinstance(contact.capacity, int) else None,
+        grows=contact.capacity == "grow",
         kinds=tuple(type(part).__name__ for part in parts),
     )
 
 
 def _triangles(part: Member) -> Index:
     mesh = part.mesh
+    if isinstance(mesh, Polyline):
+        return np.zeros((0, 3), dtype=np.int64)
     triangles: Index = mesh.boundary() if isinstance(mesh, TetMesh) else mesh.triangles
     return triangles
+
+
+def _segments(part: Member) -> Index:
+    return part.mesh.segments if isinstance(part.mesh, Polyline) else np.zeros((0, 2), dtype=np.int64)
 
 
 def _table(contact: Contact, parts: Iterable[Member]) -> Array:

@@ -104,7 +104,7 @@ class Solid(Body):
     limit_stiffness: Array | None  # [E]
     stiffness_damping: Array | float  # [E], or 0.0
     plastic: Plastic | None
-    has_triangles = True
+    has_surface = True
 
     @check_arguments("Solid")
     def __init__(

@@ -88,7 +88,7 @@ class Body(KeyPart, ABC):
     """A part with vertices: a body has a `mesh` with `vertices` [V, 3] m, its rest shape."""
 
     mesh: Any
-    has_triangles: ClassVar[bool] = False  # whether its surface is the triangles of its mesh, which `Contact` takes
+    has_surface: ClassVar[bool] = False  # whether `Contact` takes its mesh, by triangles or by segments
 
     @property
     @abstractmethod

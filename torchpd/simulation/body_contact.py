@@ -17,13 +17,14 @@ from ..plan.contact_tree import FAN_OUT
 from ..scene.contact import placed
 from ..scene.scene import SceneValues
 from .pair_forces import ContactSurfaces
-from .state import ContactHistory, HistoryState, State
+from .state import ContactHistory, HistoryState, State, widened
 
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
 _MISSING, _PINS_HELD_BACK, _UNBALANCED = 1, 2, 3  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
+_CAPACITY = 2  # place among the sizes of the op
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +77,27 @@ class BodyContact:
         forces = torch.zeros((), dtype=dtype, device=device).expand(plan.capacity, 4)
         return BodyContact(plan, _arrays(plan, dtype, device), (poses, keys, forces))
 
+    def with_capacity(self, capacity: int) -> BodyContact:
+        """The same with room for another number of pairs in an environment."""
+        sizes = self.arrays[0].clone()
+        sizes[_CAPACITY] = capacity
+        poses, keys, forces = self.history
+        history = poses, keys[:1].expand(capacity), forces[:1].expand(capacity, 4)
+        return BodyContact(replace(self.plan, capacity=capacity), [sizes, *self.arrays[1:]], history)
+
+    def check_eager(self, name: str) -> None:
+        """Refuse `torch.compile` and CUDA graphs where a step reads how many pairs there are."""
+        if torch.compiler.is_compiling():
+            where = "torch.compile"
+        elif self.arrays[1].is_cuda and torch.cuda.is_current_stream_capturing():
+            where = "a CUDA graph"
+        else:
+            return
+        raise RuntimeError(
+            f'{name}: Contact(capacity="grow") must step eagerly, got {where}, where no step can be taken again; give '
+            f"the number, Contact(capacity={self.plan.capacity}) or more"
+        )
+
     def step(
         self,
         state: State | HistoryState,
@@ -103,7 +125,7 @@ class BodyContact:
                 "the way of; leave it out"
             )
         self.check_transforms(state[0], state[1], *material)
-        before = ContactHistory(*state[2])  # type: ignore[misc]
+        before = widened(ContactHistory(*state[2]), self.plan.capacity)  # type: ignore[misc]
         history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.detach().contiguous()]
         wanted = history[0] if poses is None else poses.contiguous()
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(

@@ -233,16 +233,23 @@ class Model(Configured):
             forces: as in `forward`.
             fix: end of the errors about forces of another shape.
         """
-        return check_state(self._checked_rest(), state, self.history_at_rest(), forces=forces, fix=fix)
+        return check_state(
+            self._checked_rest(), state, self.history_at_rest(), forces=forces, fix=fix, grows=self._grows
+        )
 
     def positions_of(self, state: State | HistoryState | Tensor, name: str = "state") -> Tensor:
         """Positions of a state, or positions alone, after all checks."""
-        return positions_of(self._checked_rest(), state, self.history_at_rest(), name)
+        return positions_of(self._checked_rest(), state, self.history_at_rest(), name, self._grows)
 
     @property
     def keeps_history(self) -> bool:
         """Whether a step leaves more than positions and velocities, so that states are a `HistoryState`."""
         return self.body_contact is not None or self._flows
+
+    @property
+    def _grows(self) -> bool:
+        """Whether steps make the capacity of `Contact` larger."""
+        return self.body_contact is not None and self.body_contact.plan.grows
 
     @property
     def _flows(self) -> bool:

@@ -168,10 +168,22 @@ class Notices:
             warn_user(
                 f"Simulator: environment {worst} has {need} pairs of surfaces near each other in a step, more than the "
                 f"{capacity} of its Contact. Its step was taken back: positions, velocities and history stay as before "
-                f"(info.contact_overflow). Make the scene with Contact(capacity={2 * need}), or let fewer surfaces "
-                "come near each other",
+                f'(info.contact_overflow). Make the scene with Contact(capacity={2 * need}) or capacity="grow", or let '
+                "fewer surfaces come near each other",
                 SceneWarning,
             )
+
+    def after_growth(self, owner: object, capacity: int) -> None:
+        """Say once that a step is taken again with a larger capacity."""
+        if "growth" in self._said:
+            return
+        self._said.add("growth")
+        warn_user(
+            f"Simulator: more pairs of surfaces are near each other than the capacity of Contact, which is {capacity} "
+            "from now on; the step is taken again, and so are later ones that need more. Contact(capacity=) with the "
+            "last number, sim.body_contact.plan.capacity, saves these steps",
+            SceneWarning,
+        )
 
     def _look_for_overlaps(self, scene: Scene, positions: Tensor) -> None:
         """Check the first environment in which boxes overlap; at the 1st, 2nd, 4th, 8th ... such report."""

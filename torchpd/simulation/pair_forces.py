@@ -105,13 +105,15 @@ class ContactSurfaces:
     def corners(self, keys: Tensor) -> tuple[Tensor, Tensor]:
         """Vertices of pairs [m, 4], and whether they are edges [m], by keys of pairs, not negative."""
         edges = keys >= self.point_keys
-        first, triangle = keys // len(self.triangles), keys % len(self.triangles)
+        faces, count = len(self.triangles), max(len(self.triangles), 1)
         rest = torch.where(edges, keys - self.point_keys, 0)
-        one, other = (self.edges.long()[number] for number in (rest // len(self.edges), rest % len(self.edges)))
-        vertex = torch.where(edges, 0, first)
-        triangles = self.triangles.long()[torch.where(edges, 0, triangle)]
-        points = torch.cat([vertex[..., None], triangles], dim=-1)
-        return torch.where(edges[..., None], torch.cat([one, other], dim=-1), points), edges
+        first = self.edges.long()[rest // len(self.edges)]
+        # the last three corners: of a triangle, or of the first edge and the second one
+        sides = torch.cat([self.triangles, torch.nn.functional.pad(self.edges, (1, 0))]).long()
+        last = sides[torch.where(edges, faces + rest % len(self.edges), keys % count)]
+        middle = torch.where(edges, first[..., 1], last[..., 0])
+        vertex = torch.where(edges, first[..., 0], keys // count)
+        return torch.stack([vertex, middle, last[..., 1], last[..., 2]], dim=-1), edges
 
     def check(self, history: ContactHistory) -> None:
         """Refuse keys of another scene; reads their values.

@@ -14,7 +14,7 @@ from tqdm.auto import tqdm
 from ..common.checks import STEPS_DIFFER
 from ..plan.material import CORE_ROWS
 from ..scene.targets import Anchors, Targets
-from .state import HistoryState, HistoryTrack, State, Track, history_of
+from .state import ContactHistory, HistoryState, HistoryTrack, State, Track, history_of, widened
 from .surface_loads import SurfaceLoads
 
 if TYPE_CHECKING:
@@ -146,7 +146,17 @@ def _in_chunks(
             bar.update(steps)
     if not chunks:
         chunks.append(sim.advance(call.state, None, material, steps=0, every=1, inertial=call.inertial, report=False))
-    return tuple(torch.cat(parts) for parts in zip(*chunks, strict=True))
+    return tuple(torch.cat(parts) for parts in zip(*_as_wide(chunks), strict=True))
+
+
+def _as_wide(chunks: list[tuple[Tensor, ...]]) -> list[tuple[Tensor, ...]]:
+    """Chunks whose histories have room for as many pairs; a capacity that grows makes later ones wider."""
+    histories = [history_of(chunk[3:]) if len(chunk) > 3 else None for chunk in chunks]
+    widest = max((h.keys.shape[-1] for h in histories if isinstance(h, ContactHistory)), default=0)
+    return [
+        (*chunk[:3], *widened(history, widest)) if isinstance(history, ContactHistory) else chunk
+        for chunk, history in zip(chunks, histories, strict=True)
+    ]
 
 
 def _reached(positions: Tensor, velocities: Tensor, _rows: Tensor, *history: Tensor) -> State | HistoryState:

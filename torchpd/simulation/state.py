@@ -90,6 +90,15 @@ class ContactHistory(NamedTuple):
         return by_sizes(self, self.forces, "records", "batch", "pairs")
 
 
+def widened(history: ContactHistory, width: int) -> ContactHistory:
+    """The same history [..., M] with room for `width` pairs with forces."""
+    more = width - history.keys.shape[-1]
+    if more <= 0:
+        return history
+    pad = torch.nn.functional.pad
+    return history._replace(keys=pad(history.keys, (0, more), value=-1), forces=pad(history.forces, (0, 0, 0, more)))
+
+
 class HistoryState(NamedTuple):
     """The state of a scene with plastic solids or `Contact`: positions, velocities and history.
 

@@ -133,8 +133,12 @@ def check_state(
     *,
     forces: Tensor | None,
     fix: str,
+    grows: bool,
 ) -> Tensor | None:
-    """Implementation of `Model.check_state`, by the rest positions [V, 3] and history [n, ...] of a simulator."""
+    """Implementation of `Model.check_state`, by the rest positions [V, 3] and history [n, ...] of a simulator.
+
+    `grows`: a history may have room for any number of pairs.
+    """
     if not _is_state(state, history):
         raise TypeError(
             f"state must be {_wanted(history)}, positions and velocities [B, {len(rest)}, 3], got "
@@ -144,7 +148,7 @@ def check_state(
     if state[0].dim() == 0:  # the batch is read before an op checks the shape
         raise ValueError(f"positions must be [B, {len(rest)}, 3], got []")
     check_like("velocities", state[1], state[0], "m/s")
-    _check_history(state, history)
+    _check_history(state, history, grows)
     if forces is None:
         return None
     forces = expand_shared(to_full_precision(forces, state[0]), state[0].shape)
@@ -161,7 +165,7 @@ def check_info(info: Tensor, shape: tuple[int, int]) -> None:
 
 
 def positions_of(
-    rest: Tensor, state: State | HistoryState | Tensor, history: History | ContactHistory | None, name: str
+    rest: Tensor, state: State | HistoryState | Tensor, history: History | ContactHistory | None, name: str, grows: bool
 ) -> Tensor:
     """Implementation of `Model.positions_of`, by the rest positions [V, 3] and history [n, ...] of a simulator."""
     alone = isinstance(state, Tensor)
@@ -176,14 +180,17 @@ def positions_of(
         raise ValueError(f"{name} must be [B, {len(rest)}, 3], got {list(positions.shape)}")
     if not isinstance(state, Tensor):
         check_like("velocities", state[1], positions, "m/s")
-        _check_history(state, history)
+        _check_history(state, history, grows)
     return positions
 
 
-def _check_history(state: State | HistoryState, history: History | ContactHistory | None) -> None:
+def _check_history(state: State | HistoryState, history: History | ContactHistory | None, grows: bool) -> None:
     if history is None:
         return
     given = history_of(state[2])  # type: ignore[misc]
+    if grows and isinstance(history, ContactHistory) and isinstance(given, ContactHistory) and given.keys.dim() == 2:
+        width = given.keys.shape[1]
+        history = history._replace(keys=history.keys[:1].expand(width), forces=history.forces[:1].expand(width, 4))
     for name, own, array in zip(history._fields, history, given, strict=True):
         _check_kind(own, f"history.{name}", array)
         shape = (len(state[0]), *own.shape[-(1 if name == "keys" else 2) :])

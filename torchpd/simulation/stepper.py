@@ -83,7 +83,16 @@ class Stepper(Readable):
             positions, velocities, rows = _ops.step(state[0], state[1], forces, given, material, plan, **settings)
             after = self._after(positions, velocities, material)
         else:
-            after, rows = self.body_contact.step(state, forces, given, poses, material, plan, settings)
+            contact = self.body_contact
+            if contact.plan.grows:
+                contact.check_eager("Simulator")
+                contact = contact.with_capacity(max(contact.plan.capacity, state[2][1].shape[-1]))  # type: ignore[misc]
+            after, rows = contact.step(state, forces, given, poses, material, plan, settings)
+            while contact.plan.grows and (missing := int(Info.from_rows(rows).contact_overflow.max())):
+                contact = contact.with_capacity(contact.plan.capacity + max(contact.plan.capacity, missing))
+                self._notices.after_growth(self, contact.plan.capacity)
+                after, rows = contact.step(state, forces, given, poses, material, plan, settings)
+            self.body_contact = contact
             self._notices.after_contact(self, after[0], rows)
         if report and not torch.compiler.is_compiling():
             self._notices.after(self, after[0], rows)
@@ -160,6 +169,11 @@ class Stepper(Readable):
             raise TypeError(
                 f"step_: info must be None or a float64 tensor {[len(state[0]), self.info_width]} to fill in, got "
                 f"{type(info).__name__}"
+            )
+        if self._grows:
+            raise RuntimeError(
+                'step_: Contact(capacity="grow") makes the history of a state wider, got a state to overwrite; call '
+                "the simulator, or give a number of pairs"
             )
         given, inertial = _first_iterate(start, state[0])
         material = self.with_history(self.material_at(targets, state[0].shape[0]), state)

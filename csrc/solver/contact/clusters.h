@@ -213,7 +213,7 @@ class ClusterPairs {
       if (!of.wanted[of.body[own]]) continue;
       hull = of.hull(own);
       if (of.has_points(own)) {
-        walk_.start(lanes, of.triangles, hull, of.triangles.first);
+        if (of.triangles.count > 0) walk_.start(lanes, of.triangles, hull, of.triangles.first);
       } else {
         walk_.start(lanes, of.edges, hull, own);
       }

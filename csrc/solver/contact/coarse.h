@@ -7,6 +7,7 @@
 // of its swept boxes itself, joins the islands that may meet there, and a search must follow.
 #pragma once
 #include "solver/coarse/island.h"
+#include "solver/coarse/thin.h"
 #include "solver/contact/approach.h"
 #include "solver/contact/schedule.h"
 
@@ -221,7 +222,9 @@ class ContactCorrection {
       sums[n] = n < S::target_offset ? mean[n]
                 : n < S::pins        ? moments[n - S::target_offset]
                                      : pins[n - S::pins];
-    a_.coarse_body[g] = CoarseBody(RigidBody(sums));
+    RigidBody body(sums);
+    resist_thin_turns(body);
+    a_.coarse_body[g] = CoarseBody(body);
     a_.goes[g] = a_.coarse_body[g].moves();
   }
 

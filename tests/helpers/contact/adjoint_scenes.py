@@ -156,7 +156,7 @@ def pairs_of(plan: Any, keys: Tensor) -> Pairs:
     triangles, edges = (torch.tensor(array).long() for array in (plan.triangles, plan.edges))
     points, others = keys[keys < first_edge], keys[keys >= first_edge] - first_edge
     vertices = torch.cat([
-        torch.cat([(points // len(triangles))[:, None], triangles[points % len(triangles)]], dim=1),
+        torch.cat([(points // max(len(triangles), 1))[:, None], triangles[points % max(len(triangles), 1)]], dim=1),
         torch.cat([edges[others // len(edges)], edges[others % len(edges)]], dim=1),
     ])  # fmt: skip
     body = torch.tensor(plan.body).long()[vertices[:, [0, 3]]]
@@ -281,6 +281,17 @@ def clamp() -> Step:
     return prepared(scene, np.where(upper[:, None] & (x[:, None] > 0.03), [0.0, -1.0, 0.1], 0.0), 1)
 
 
+@cache
+def rod_on_a_rod(ends: bool = False) -> Step:
+    """A rod slides over another one that springs hold at its ends; `ends`: it stands on the other one."""
+    lower = pd.Rod(np.linspace((-0.2, 0.0, 0.0), (0.21, 0.0, 0.01), 5), 1e6, 4e-3)
+    top = ((0.013, 0.002, 0.0), (0.02, 0.2, 0.01)) if ends else ((0.013, 0.003, -0.18), (0.02, 0.002, 0.2))
+    upper = pd.Rod(np.linspace(*top, 5), 1e6, 4e-3)
+    pin = pd.Pin(lower, [0, 1, 3, 4], stiffness=1e4)
+    scene = pd.Scene(lower, upper, pin, gravity(), pd.Contact(friction=0.2, thickness=2e-3))
+    return prepared(scene, [[0.0, 0.0, 0.0]] * 5 + [[0.0 if ends else 0.4, -0.3, 0.1]] * 5, 1)
+
+
 CASES = {
     "vertex on a triangle": vertex_on_triangle,
     "edge on an edge": edge_on_edge,
@@ -290,6 +301,8 @@ CASES = {
     "sticking cube": sticking_cube,
     "cloth over a cube": cloth_over_cube,
     "clamp": clamp,
+    "rod on a rod": rod_on_a_rod,
+    "end of a rod": lambda: rod_on_a_rod(ends=True),
 }
 
 

@@ -39,6 +39,7 @@ def surfaces_of(sim: pd.Simulator, *, whole: bool = False) -> Surfaces:
     return Surfaces(
         torch.tensor(plan.rest), torch.tensor(plan.triangles).long(), torch.tensor(plan.body).long(),
         torch.tensor(plan.kinematic), own, plan.thickness, torch.zeros(count, count, dtype=torch.float64),
+        torch.tensor(plan.edges).long(),
     )  # fmt: skip
 
 

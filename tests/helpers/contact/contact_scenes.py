@@ -308,6 +308,26 @@ def gripper(friction: float, cells: int = 3, **options: Any) -> ContactCase:
     return ContactCase(made, each(scene, (0.0, 0.0, 0.0)), poses=poses)
 
 
+def crossed_rods(speed: float = 10.0, **options: Any) -> ContactCase:
+    """A rod of eight segments falls across one whose ends are clamped."""
+    lower, upper = (
+        pd.Rod(np.linspace(start, end, 9), 1e6, 4e-3)
+        for start, end in (((-0.2, 0.0, 0.0), (0.2, 0.0, 0.0)), ((0.013, 0.05, -0.2), (0.013, 0.05, 0.2)))
+    )
+    scene = falling(lower, upper, pd.Pin(lower, [0, 1, 7, 8]))
+    made = contact_scene(scene, thickness=2.0 * THICKNESS, **options)
+    return ContactCase(made, each(scene, (0.0, 0.0, 0.0), (0.0, -speed, 0.0)))
+
+
+def rod_on_sheet(speed: float = 20.0, **options: Any) -> ContactCase:
+    """A rod falls, end ahead, on a sheet that is pinned at its rim."""
+    sheet = sheet_body((0.2, 0.2), (4, 4), lambda p: p - [0.1, 0.0, 0.1])
+    rim = (np.abs(sheet.mesh.vertices) > 0.1 - 1e-9).any(axis=1)
+    rod = pd.Rod(np.linspace((-0.05, 0.02, 0.013), (0.04, 0.07, 0.021), 6), 1e6, 2e-3)
+    scene = falling(sheet, rod, pd.Pin(sheet, rim))
+    return ContactCase(contact_scene(scene, thickness=THICKNESS, **options), each(scene, (0, 0, 0), (0, -speed, 0)))
+
+
 def ring_line(number: int, cells: int = 16) -> Index:
     """Vertices of the centre line of a ring, in order."""
     return number * 9 * cells + 9 * np.arange(cells) + 4

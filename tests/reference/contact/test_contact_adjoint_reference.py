@@ -9,7 +9,7 @@ from adjoint_scenes import CASES, seeded
 # m, m/s, N: where neither truncation of a difference of fourth order nor rounding counts
 STEPS = {
     "positions": 1e-7, "velocities": 1e-5, "forces": 1e-5, "start": 1e-7, "end": 1e-7, "contact_thickness": 1e-7,
-    "membrane_poisson": 1e-2,
+    "membrane_poisson": 1e-2, "rest_length": 1e-6,
 }  # fmt: skip
 
 

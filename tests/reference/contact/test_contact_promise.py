@@ -15,6 +15,7 @@ from contact_scenes import (
     ContactCase,
     Witness,
     ball_on_sheet,
+    crossed_rods,
     fixed_edge,
     folded_cloth,
     free_hit,
@@ -24,6 +25,7 @@ from contact_scenes import (
     promised,
     ring_line,
     rings,
+    rod_on_sheet,
     twisted_strip,
     two_cubes,
     watched,
@@ -38,6 +40,29 @@ from torchpd.reference.contact.search import near_pairs
 FEW = pytest.mark.parametrize(
     ("iterations", "precision"), [(4, torch.float32), (16, torch.float64)], ids=["4 float32", "16 float64"]
 )
+
+
+@FEW
+@pytest.mark.parametrize("speed", [1.0, 40.0])
+def test_rods_that_cross(speed: float, iterations: int, precision: torch.dtype) -> None:
+    """Two segments that pass through each other intersect at no time: the witness follows their ways."""
+    ends = promised(crossed_rods(speed, dtype=precision), 6, iterations)
+    assert min(end.gap for end in ends) < 1.1
+
+
+@FEW
+def test_a_rod_on_a_sheet(iterations: int, precision: torch.dtype) -> None:
+    assert min(end.gap for end in promised(rod_on_sheet(dtype=precision), 6, iterations)) < 1.1
+
+
+def test_the_witness_sees_rods_pass() -> None:
+    """The control: without pairs of edges they go through each other, and exact signs know nothing of it."""
+    case = crossed_rods()
+    witness, rest = Witness(case), case.scene.surfaces.rest
+    below = torch.where((case.scene.surfaces.body == 1)[:, None], rest - torch.tensor([0.0, 0.1, 0.0]), rest)
+    assert not witness.intersects(below)
+    assert witness.collides(rest, below)
+    assert not witness.collides(rest, torch.where((case.scene.surfaces.body == 1)[:, None], 2.0 * rest - below, rest))
 
 
 @FEW

@@ -36,6 +36,7 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 HALVINGS = 6  # of the interval of a share: another motion follows one that is cut
+LEAST_TURN = 1e-12  # share of the moment by which turns count that places do not decide
 BOW = 0.25  # of the chord of a turn up to a right angle: how far a share of it leaves the straight way
 
 
@@ -112,7 +113,9 @@ class RigidWay:
     def between(vertices: Index, before: Array, after: Array, center: Array) -> RigidWay:
         """The motion from places `before` to `after` [n, 3] m, about a centre [3] m."""
         first, last = before.mean(axis=0), after.mean(axis=0)
-        left, _, right = np.linalg.svd((after - last).T @ (before - first))
+        moment = (after - last).T @ (before - first)
+        # a straight rod turns about its own axis as little as it may
+        left, _, right = np.linalg.svd(moment + LEAST_TURN * np.linalg.norm(moment) * np.eye(3))
         turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
         skew = turn - turn.T
         axis = 2.0 / (1.0 + np.trace(turn)) * np.array([skew[2, 1], skew[0, 2], skew[1, 0]])

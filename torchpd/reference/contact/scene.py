@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ...scene.cloth import Cloth
 from ...scene.effects import Solid
+from ...scene.rod import Rod
 from ...scene.scene import Scene, SceneValues
 from .crossings import crossings
 from .distance import closest
@@ -111,7 +112,7 @@ def contact_scene(
     values: SceneValues | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> ContactScene:
-    """Surfaces of the solids and cloths of a scene and of colliders.
+    """Surfaces of the solids, cloths and rods of a scene and of colliders.
 
     Args:
         scene: the deformable bodies, bodies 0, 1, ...
@@ -123,13 +124,16 @@ def contact_scene(
         dtype: of all places and forces of contact.
     """
     values = scene.values() if values is None else values
-    places, faces, bodies = [], [], []
+    places, bodies = [], []
+    faces, lines = [torch.zeros((0, 3), dtype=torch.int64)], [torch.zeros((0, 2), dtype=torch.int64)]
     for number, body in enumerate(scene.bodies):
         offset = scene.vertex_range(body).start
         if isinstance(body, Solid):
             faces.append(offset + surface_triangles(torch.as_tensor(np.array(body.mesh.tets))))
         elif isinstance(body, Cloth):
             faces.append(offset + torch.as_tensor(np.array(body.mesh.triangles)))
+        elif isinstance(body, Rod):
+            lines.append(offset + torch.as_tensor(body.mesh.segments))
         bodies.append(np.full(len(body.mesh.vertices), number))
     own, points = len(scene.bodies), [np.zeros_like(values.rest_positions)]
     start = len(values.rest_positions)
@@ -157,6 +161,7 @@ def contact_scene(
         self_contact=allowed,
         thickness=thickness,
         friction=torch.as_tensor(friction, dtype=dtype).expand(total, total),
+        segments=torch.cat(lines),
     )
     near_pairs(surfaces, surfaces.rest, torch.full((len(body_of),), thickness, dtype=dtype))  # refuses rest distance 0
     return ContactScene(values, surfaces, collider, local, poses)

@@ -58,7 +58,7 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Surfaces:
-    """Triangles of all bodies, with what decides about their pairs."""
+    """Triangles and rods of all bodies, with what decides about their pairs."""
 
     rest: Tensor  # [N, 3] m
     triangles: Tensor  # [T, 3]
@@ -67,6 +67,7 @@ class Surfaces:
     self_contact: Tensor  # [bodies] whether parts of a body are pairs
     thickness: float  # r, m: surfaces rest r apart
     friction: Tensor  # [bodies, bodies] of each pair of bodies
+    segments: Tensor | None = None  # [n, 2] of rods
 
     def __post_init__(self) -> None:
         if not self.thickness > 0.0:
@@ -87,15 +88,16 @@ class Surfaces:
 
     @cached_property
     def edges(self) -> Tensor:
-        """Edges of the triangles [E, 2], each once."""
+        """Edges of the triangles and of rods [E, 2], each once."""
         sides = torch.cat([self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]])
+        sides = sides if self.segments is None else torch.cat([sides, self.segments])
         edges: Tensor = torch.unique(sides.sort(dim=1).values, dim=0)
         return edges
 
     @cached_property
     def vertices(self) -> Tensor:
-        """Vertices of the triangles [S]."""
-        vertices: Tensor = torch.unique(self.triangles)
+        """Ends of the edges [S]."""
+        vertices: Tensor = torch.unique(self.edges)
         return vertices
 
     @cached_property
