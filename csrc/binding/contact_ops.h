@@ -33,6 +33,7 @@ enum ContactArray : int {
   contact_local,
   contact_cell,
   contact_friction,
+  contact_rigid,
   contact_thickness,
   contact_array_count
 };
@@ -111,6 +112,10 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
                     " bodies, got ", describe(arrays[contact_friction]),
                     "; compile the scene again");
   plan.friction = arrays[contact_friction].const_data_ptr<T>();
+  const std::int64_t rigid = rows_of_array(contact_rigid);
+  const T* const rows = reals(contact_rigid, rigid > 0 ? plan.colliders : 0, 10,
+                              "masses, centres and second moments of colliders");
+  plan.rigid = rigid > 0 ? rows : nullptr;
   // a number of the host, as sizes
   check_array(arrays[contact_thickness], scalar_type<T>, 1, 1, {at::kCPU, "every plan's thickness"},
               "contact", "thickness [m]");

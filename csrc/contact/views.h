@@ -21,6 +21,9 @@ struct ContactPlan {
   // no vertex, or 0
   const T *rest, *rest_apart;
   const T *local, *cell, *friction;  // [vertices, 3] of colliders; [vertices]; [bodies, bodies]
+  // [colliders, 10] of colliders with a mass: m / h^2, centre of mass, second moment over h^2 (xx xy xz yy yz zz), 0 for
+  // others; null if none has
+  const T* rigid = nullptr;
   int vertices = 0, body_vertices = 0, triangles = 0, edges = 0, points = 0, bodies = 0,
       colliders = 0, capacity = 0, clusters = 0, point_clusters = 0, edge_clusters = 0;
   std::int64_t rest_pairs = 0;

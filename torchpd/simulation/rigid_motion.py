@@ -1,0 +1,130 @@
+"""The motion of colliders with a mass: free in a step, and what a step leaves of it.
+
+With the mass m, the centre of mass c, the rotation R and the angular momentum L about c, the free motion of a step is
+
+    c_goal = c + h V,   V = v + h (g + F / m);   Q = exp(h w) R,   w = J(R_mid)^-1 L_free,   L_free = L + h T,
+    R_mid = exp(h w / 2) R: the midpoint rule, which keeps L_free.
+
+A step ends at c', R' (csrc/solver/contact/rigid.h). It leaves the velocity and the angular momentum
+
+    v' = V + (c' - c_goal) / h,   L' = L_free + 1 / h sum m_i (Q r_i) x (R' r_i).
+
+Once converged, m (v' - V) = h f and L' - L_free = h t, with the force f and the torque t of contact at the end.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..common.small_matrices import dot, inverse, product
+
+__all__ = ["FreeMotion", "RigidBodies", "refuse_gradients"]
+
+_MIDPOINT_ROUNDS = 16  # each takes off a factor of about half of the turn
+
+
+class FreeMotion(NamedTuple):
+    """The free motion of a step."""
+
+    poses: Tensor  # [B, C, 7] at its end
+    velocity: Tensor  # [B, C, 3] m/s of the centre of mass
+    momentum: Tensor  # [B, C, 3] kg m^2/s about it
+
+
+class RigidBodies(NamedTuple):
+    """Colliders with a mass, among all."""
+
+    is_rigid: Tensor  # [C, 1] bool
+    mass: Tensor  # [C, 1] kg, 1 for others
+    center: Tensor  # [C, 3] m, in their own axes
+    inertia: Tensor  # [C, 3, 3] kg m^2, the identity for others
+
+    def free_motion(
+        self, poses: Tensor, motion: Tensor, wrenches: Tensor | None, gravity: Tensor, time_step: float
+    ) -> FreeMotion:
+        """The free motion from poses [B, C, 7] and velocities [B, C, 6]; gravity [3] or [B, 3]."""
+        turn = _rotation(poses[..., 3:])
+        arm = _times(turn, self.center)
+        velocity = motion[..., :3] + time_step * gravity.unsqueeze(-2)
+        momentum = _times(self._at(turn), motion[..., 3:])
+        if wrenches is not None:
+            force, torque = wrenches[..., :3], wrenches[..., 3:]
+            velocity = velocity + (time_step / self.mass) * force
+            momentum = momentum + time_step * (torque - torch.linalg.cross(arm, force))
+        half = torch.zeros_like(momentum)
+        for _ in range(_MIDPOINT_ROUNDS):
+            middle = _rotation(_turned(half, poses[..., 3:]))
+            half = 0.5 * time_step * _times(inverse(self._at(middle)), momentum)
+        end = _turned(2.0 * half, poses[..., 3:])
+        origin = poses[..., :3] + time_step * velocity + (arm - _times(_rotation(end), self.center))
+        return FreeMotion(torch.cat([origin, end], dim=-1), velocity, momentum)
+
+    def motion_after(self, free: FreeMotion, poses: Tensor, time_step: float) -> Tensor:
+        """Velocities [B, C, 6] of the centre of mass and angular ones, at the poses that a step ends with."""
+        goal, turn = _rotation(free.poses[..., 3:]), _rotation(poses[..., 3:])
+        left = (poses[..., :3] - free.poses[..., :3]) + (_times(turn, self.center) - _times(goal, self.center))
+        trace = self.inertia.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        second = 0.5 * trace * torch.eye(3, dtype=poses.dtype, device=poses.device) - self.inertia
+        across = product(product(goal, second.expand_as(goal)), turn.mT)
+        # sum m (Q r) x (R' r), the axial vector of Q S R'^T
+        x, y, z = (across[..., i, j] - across[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1)))
+        momentum = free.momentum + torch.stack([x, y, z], dim=-1) / time_step
+        angular = _times(inverse(self._at(turn)), momentum)
+        moves = torch.cat([free.velocity + left / time_step, angular], dim=-1)
+        return torch.where(self.is_rigid, moves, torch.zeros_like(moves))
+
+    def _at(self, turn: Tensor) -> Tensor:
+        """Moments of inertia in world axes."""
+        return product(product(turn, self.inertia.expand_as(turn)), turn.mT)
+
+
+class _Refused(torch.autograd.Function):
+    """Passes tensors on, and refuses their gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
+        return tuple(tensor.view_as(tensor) for tensor in tensors)
+
+    @staticmethod
+    def backward(ctx: Any, *_: Any) -> Any:
+        raise NotImplementedError(
+            "gradients of a step must not be asked where a Collider has a mass, got backward() through one; give the "
+            "Collider mass=None and its pose as a target, or detach() the state (docs/limits.md)"
+        )
+
+
+def refuse_gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """The same tensors, whose backward pass raises."""
+    found: tuple[Tensor, ...] = _Refused.apply(*tensors)  # type: ignore[no-untyped-call]
+    return found
+
+
+def _times(matrix: Tensor, vector: Tensor) -> Tensor:
+    return dot(matrix, vector.unsqueeze(-2).expand_as(matrix))
+
+
+def _rotation(quaternion: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of quaternions [..., 4], which need not have length 1."""
+    w, x, y, z = quaternion.unbind(-1)
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    rows = [
+        [1.0 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)],
+        [s * (x * y + w * z), 1.0 - s * (x * x + z * z), s * (y * z - w * x)],
+        [s * (x * z - w * y), s * (y * z + w * x), 1.0 - s * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def _turned(turn: Tensor, quaternion: Tensor) -> Tensor:
+    """Unit quaternions turned by rotation vectors [..., 3]; without a turn the same bits."""
+    angle = 0.5 * torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
+    w, axis = torch.cos(angle), 0.5 * torch.sinc(angle / torch.pi) * turn
+    own, of = quaternion[..., :1], quaternion[..., 1:]
+    product_w = w * own - dot(axis, of)[..., None]
+    product_axis = w * of + own * axis + torch.linalg.cross(axis, of)
+    made = torch.cat([product_w, product_axis], dim=-1)
+    unit = made / torch.linalg.vector_norm(made, dim=-1, keepdim=True)
+    return torch.where(angle > 0.0, unit, quaternion)
