@@ -83,7 +83,7 @@ def _inertia(value: ArrayLike) -> Array:
 
 def _is_closed(mesh: TriMesh) -> bool:
     """Whether each edge joins two triangles that pass it in opposite directions, around a volume."""
-    if mesh.volume == 0.0:
+    if mesh.volume() == 0.0:
         return False
     a, b = mesh.triangles, np.roll(mesh.triangles, -1, axis=1)
     ways = np.stack([a.ravel(), b.ravel()], axis=1)

@@ -142,7 +142,7 @@ class BodyContact:
         # the residual of other scenes would count forces between bodies as unbalanced
         unbalanced, gaps = numbers[:, _UNBALANCED : _UNBALANCED + 1], numbers[:, :_PINS_HELD_BACK]
         rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back], dim=1)
-        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow, motion)), rows
+        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, motion, flow)), rows
 
     @property
     def surfaces(self) -> ContactSurfaces:

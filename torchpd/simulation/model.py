@@ -255,8 +255,7 @@ class Model(Configured):
         if self.body_contact is None:
             return History(*own) if own else None
         (flow,) = own or [self.rest_positions.new_zeros(0, _FLOW_WIDTH)]
-        poses, keys, forces, motion = self.body_contact.history
-        return ContactHistory(poses, keys, forces, flow.detach(), motion)
+        return ContactHistory(*self.body_contact.history, flow.detach())
 
     def with_history(self, material: list[Tensor], state: State | HistoryState | Tensor) -> list[Tensor]:
         """The material with the history of a checked state; positions alone have that of a new state."""

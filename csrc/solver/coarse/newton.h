@@ -66,8 +66,7 @@ PD_HD void solve_twist(double (&a)[27], double (&x)[6]) {
     for (int c = j + 1; c < 6; ++c) {
       const double factor = inverse[j] * a[at(c, j)];
       PD_UNROLL
-      for (int r = c; r <= 6; ++r)
-        a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
+      for (int r = c; r <= 6; ++r) a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
     }
   }
   PD_UNROLL

@@ -180,11 +180,11 @@ class RigidColliders {
       if (!is_rigid(c)) return;
       const RigidCollider& of = a_.rigid_collider[c];
       const bool meets = some && a_.side_start[c] < a_.side_start[c + 1];
-      a_.hand[c].goal = meets ? pd::moved(a_.hand[c].pose, of.center, of.shift, of.turn) : free_goal(c);
+      a_.hand[c].goal =
+          meets ? pd::moved(a_.hand[c].pose, of.center, of.shift, of.turn) : free_goal(c);
     });
-    each_vertex(team, [&](int v, int c) {
-      a_.target[v] = a_.hand[c].goal.place(local_point(plan_, v));
-    });
+    each_vertex(team,
+                [&](int v, int c) { a_.target[v] = a_.hand[c].goal.place(local_point(plan_, v)); });
   }
 
   // Colliders stay where they are.
@@ -228,8 +228,7 @@ class RigidColliders {
       const int v = a_.moved[n], c = plan_.collider[v];
       if (c < 0 || !is_rigid(c)) return;
       const RigidCollider& of = a_.rigid_collider[c];
-      const Vec3<double> by =
-          of.shift + cross(of.turn, widened<double>(a_.place[v]) - of.at);
+      const Vec3<double> by = of.shift + cross(of.turn, widened<double>(a_.place[v]) - of.at);
       a_.moved_by[v] = {T(by.x), T(by.y), T(by.z), T(0)};
     });
   }
@@ -242,12 +241,14 @@ class RigidColliders {
     Vec3<T> between = vector(Rows::between);
     for (int corner = 0; corner < 4; ++corner) {
       const Four<T> by = a_.moved_by[rows_.vertex(corner, q)];
-      between = multiply_add(rows_.at(Rows::weight + corner, q), Vec3<T>{by.x, by.y, by.z}, between);
+      between =
+          multiply_add(rows_.at(Rows::weight + corner, q), Vec3<T>{by.x, by.y, by.z}, between);
     }
     const T beta = rows_.at(Rows::beta, q), friction = rows_.at(Rows::friction, q);
     const Vec3<T> normal = vector(Rows::normal), before = vector(Rows::before);
     const Multiplier<T> old{rows_.at(Rows::normal_force, q), vector(Rows::tangential)},
-        next = pd::advance(old, beta, rows_.at(Rows::thickness, q), friction, normal, between, before);
+        next =
+            pd::advance(old, beta, rows_.at(Rows::thickness, q), friction, normal, between, before);
     const Vec3<T> pull = tangential(
         subtract_product(old.tangential, beta, tangential(between - before, normal)), normal);
     const T size = square_root(dot(pull, pull)), bound = friction * next.normal;
@@ -269,7 +270,8 @@ class RigidColliders {
                        torque = of.torque - of.inertia * of.turn;
     const double own[6] = {force.x, force.y, force.z, torque.x, torque.y, torque.z};
     const Mat3<double>& j = of.inertia;
-    const double turns[6] = {j.row[0].x, j.row[1].x, j.row[1].y, j.row[2].x, j.row[2].y, j.row[2].z};
+    const double turns[6] = {j.row[0].x, j.row[1].x, j.row[1].y,
+                             j.row[2].x, j.row[2].y, j.row[2].z};
     double terms[27], way[6];
     for (int r = 0; r <= 6; ++r) {
       for (int c = 0; c <= r && c < 6; ++c) {
