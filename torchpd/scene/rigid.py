@@ -27,11 +27,6 @@ class RigidMass(NamedTuple):
     center: Array  # [3] m, of mass, in the axes of the mesh
     inertia: Array  # [3, 3] kg m^2 about that centre
 
-    @property
-    def second_moment(self) -> Array:
-        """Integral of r r^T over the mass [3, 3] kg m^2, r from the centre: tr(J) / 2 - J."""
-        return np.asarray(0.5 * np.trace(self.inertia) * np.eye(3) - self.inertia)
-
 
 def rigid_mass(mesh: TriMesh, mass: float, inertia: ArrayLike | None) -> RigidMass:
     """Mass of a body with this surface.

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ..ops.diagonal import named_material
@@ -30,6 +29,7 @@ __all__ = ["BodyContact"]
 _ops = torch.ops.torchpd
 _MISSING, _PINS_HELD_BACK, _UNBALANCED = 1, 2, 3  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
+_RIGID_NUMBERS = 13  # rigid_numbers in csrc/contact/views.h: filled in by steps, of scenes with such colliders alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +120,14 @@ class BodyContact:
             gravity = named_material(material)["gravity"]
             free = rigid.free_motion(history[0], motion, inputs.wrenches, gravity, time_step)
             wanted = torch.where(rigid.is_rigid, free.poses, wanted)
-            scale = arrays[CONTACT_RIGID].new_ones(10)
-            scale[0] = scale[4:] = time_step**-2
             arrays = list(arrays)
-            arrays[CONTACT_RIGID] = arrays[CONTACT_RIGID] * scale
+            arrays[CONTACT_RIGID] = rigid.rows(free, time_step)
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
             state[0], state[1], forces, wanted, history, material, plan, arrays, **settings
         )
         missing = (numbers[:, _MISSING] > 0)[:, None, None]
         if rigid is not None:
-            motion = torch.where(missing, motion, rigid.motion_after(free, actual, time_step))
+            motion = torch.where(missing, motion, rigid.motion_after(free, history[0], actual, time_step))
             positions, velocities, actual, motion = refuse_gradients(positions, velocities, actual, motion)
         flow = before.flow
         if flow.shape[-2]:
@@ -199,19 +197,10 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     search = [clusters.leaves.reshape(-1, FAN_OUT), clusters.body, np.stack(starts)]
     rest = [plan.near.thickness, plan.shape, plan.apart]
-    reals = [*rest, plan.points.reshape(-1, 3), plan.cell, plan.friction, _rigid_rows(plan)]
+    reals = [*rest, plan.points.reshape(-1, 3), plan.cell, plan.friction, np.zeros((0, _RIGID_NUMBERS))]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     moved = [array.to(device) for array in (*map(whole, [*surfaces, *search]), keys, *map(real, reals))]
     return [sizes, *moved, real([plan.thickness])]
-
-
-def _rigid_rows(plan: ContactPlan) -> NDArray[np.float64]:
-    """Rows [C, 10] of colliders: mass, centre of mass, second moment by xx xy xz yy yz zz; none if none has a mass."""
-    rows = np.zeros((len(plan.rigid) if any(plan.rigid) else 0, 10))
-    for row, of in zip(rows, plan.rigid, strict=False):
-        if of is not None:
-            row[:] = [of.mass, *of.center, *of.second_moment[np.triu_indices(3)]]
-    return rows
 
 
 def _rigid_bodies(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> RigidBodies | None:

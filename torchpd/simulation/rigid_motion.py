@@ -2,12 +2,12 @@
 
 With the mass m, the centre of mass c, the rotation R and the angular momentum L about c, the free motion of a step is
 
-    c_goal = c + h V,   V = v + h (g + F / m);   Q = exp(h w) R,   w = J(R_mid)^-1 L_free,   L_free = L + h T,
-    R_mid = exp(h w / 2) R: the midpoint rule, which keeps L_free.
+    c_goal = c + h V,   V = v + h (g + F / m);   Q = exp(h w) R,   w = J^-1 L_free,   L_free = L + h T,
 
-A step ends at c', R' (csrc/solver/contact/rigid.h). It leaves the velocity and the angular momentum
+J the moment of inertia at R_mid = exp(h w / 2) R: the midpoint rule, which keeps L_free. Its turn counts up to half a
+radian. A step ends at c' and exp(u) R (csrc/solver/contact/rigid.h). It leaves
 
-    v' = V + (c' - c_goal) / h,   L' = L_free + 1 / h sum m_i (Q r_i) x (R' r_i).
+    v' = V + (c' - c_goal) / h,   L' = L_free - V(u)^-T (L_free - J u / h),   V(u) = int_0^1 exp(s [u]) ds.
 
 Once converged, m (v' - V) = h f and L' - L_free = h t, with the force f and the torque t of contact at the end.
 """
@@ -23,7 +23,9 @@ from ..common.small_matrices import dot, inverse, product
 
 __all__ = ["FreeMotion", "RigidBodies", "refuse_gradients"]
 
-_MIDPOINT_ROUNDS = 16  # each takes off a factor of about half of the turn
+_MIDPOINT_ROUNDS = 12  # each takes off a factor of at most half of the turn
+_MIDDLE = 0.5  # rad, most turn to the middle
+_SERIES = 0.1  # rad, below which quotients of differences would cancel
 
 
 class FreeMotion(NamedTuple):
@@ -32,6 +34,7 @@ class FreeMotion(NamedTuple):
     poses: Tensor  # [B, C, 7] at its end
     velocity: Tensor  # [B, C, 3] m/s of the centre of mass
     momentum: Tensor  # [B, C, 3] kg m^2/s about it
+    inertia: Tensor  # [B, C, 3, 3] kg m^2 in world axes at the middle
 
 
 class RigidBodies(NamedTuple):
@@ -54,25 +57,33 @@ class RigidBodies(NamedTuple):
             force, torque = wrenches[..., :3], wrenches[..., 3:]
             velocity = velocity + (time_step / self.mass) * force
             momentum = momentum + time_step * (torque - torch.linalg.cross(arm, force))
-        half = torch.zeros_like(momentum)
+        half, inertia = torch.zeros_like(momentum), self._at(turn)
         for _ in range(_MIDPOINT_ROUNDS):
-            middle = _rotation(_turned(half, poses[..., 3:]))
-            half = 0.5 * time_step * _times(inverse(self._at(middle)), momentum)
-        end = _turned(2.0 * half, poses[..., 3:])
+            half = 0.5 * time_step * _times(inverse(inertia), momentum)
+            far = torch.linalg.vector_norm(half, dim=-1, keepdim=True) / _MIDDLE
+            inertia = self._at(_rotation(_turned(half / far.clamp(min=1.0), poses[..., 3:])))
+        end = _turned(time_step * _times(inverse(inertia), momentum), poses[..., 3:])
         origin = poses[..., :3] + time_step * velocity + (arm - _times(_rotation(end), self.center))
-        return FreeMotion(torch.cat([origin, end], dim=-1), velocity, momentum)
+        return FreeMotion(torch.cat([origin, end], dim=-1), velocity, momentum, inertia)
 
-    def motion_after(self, free: FreeMotion, poses: Tensor, time_step: float) -> Tensor:
-        """Velocities [B, C, 6] of the centre of mass and angular ones, at the poses that a step ends with."""
-        goal, turn = _rotation(free.poses[..., 3:]), _rotation(poses[..., 3:])
-        left = (poses[..., :3] - free.poses[..., :3]) + (_times(turn, self.center) - _times(goal, self.center))
-        trace = self.inertia.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-        second = 0.5 * trace * torch.eye(3, dtype=poses.dtype, device=poses.device) - self.inertia
-        across = product(product(goal, second.expand_as(goal)), turn.mT)
-        # sum m (Q r) x (R' r), the axial vector of Q S R'^T
-        x, y, z = (across[..., i, j] - across[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1)))
-        momentum = free.momentum + torch.stack([x, y, z], dim=-1) / time_step
-        angular = _times(inverse(self._at(turn)), momentum)
+    def rows(self, free: FreeMotion, time_step: float) -> Tensor:
+        """Rows [B C, 13] of the op, csrc/contact/views.h: zeros for colliders without a mass."""
+        batch, inertia = len(free.poses), free.inertia * time_step**-2
+        mass = (self.mass * time_step**-2).expand(batch, -1, 1)
+        sides = [inertia[..., 0, :], inertia[..., 1, 1:], inertia[..., 2, 2:]]
+        row = torch.cat([mass, self.center.expand(batch, -1, 3), *sides, free.momentum / time_step], dim=-1)
+        return torch.where(self.is_rigid, row, torch.zeros_like(row)).flatten(0, 1)
+
+    def motion_after(self, free: FreeMotion, before: Tensor, poses: Tensor, time_step: float) -> Tensor:
+        """Velocities [B, C, 6] of the centre of mass and angular ones, after a step from poses `before`."""
+        goal, end = _rotation(free.poses[..., 3:]), _rotation(poses[..., 3:])
+        left = (poses[..., :3] - free.poses[..., :3]) + (_times(end, self.center) - _times(goal, self.center))
+        turn = _turn_between(before[..., 3:], poses[..., 3:])
+        taken = _unmean_rotated(-turn, free.momentum - _times(free.inertia, turn) / time_step)
+        # to the bit where nothing was in the way, and for any turn
+        arrived = (poses == free.poses).all(dim=-1, keepdim=True)
+        momentum = torch.where(arrived, free.momentum, free.momentum - taken)
+        angular = _times(inverse(self._at(end)), momentum)
         moves = torch.cat([free.velocity + left / time_step, angular], dim=-1)
         return torch.where(self.is_rigid, moves, torch.zeros_like(moves))
 
@@ -128,3 +139,27 @@ def _turned(turn: Tensor, quaternion: Tensor) -> Tensor:
     made = torch.cat([product_w, product_axis], dim=-1)
     unit = made / torch.linalg.vector_norm(made, dim=-1, keepdim=True)
     return torch.where(angle > 0.0, unit, quaternion)
+
+
+def _turn_between(start: Tensor, end: Tensor) -> Tensor:
+    """Rotation vectors [..., 3] of the smaller turn from one unit quaternion to another."""
+    w, axis = start[..., :1], -start[..., 1:]
+    own, of = end[..., :1], end[..., 1:]
+    along = own * w - dot(of, axis)[..., None]
+    across = own * axis + w * of + torch.linalg.cross(of, axis)
+    size = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+    sign = torch.where(along < 0.0, -1.0, 1.0).to(start.dtype)
+    angle = 2.0 * torch.atan2(size, sign * along)
+    return sign * torch.where(size > 0.0, angle / size.clamp(min=torch.finfo(size.dtype).tiny), 2.0) * across
+
+
+def _unmean_rotated(turn: Tensor, vector: Tensor) -> Tensor:
+    """V(turn)^-1 vector, as csrc/math/screw.h."""
+    square = dot(turn, turn)[..., None]
+    half = 0.5 * square.sqrt()
+    safe = torch.where(2.0 * half > _SERIES, half, torch.ones_like(half))
+    exact = (1.0 - safe / torch.tan(safe)) / (4.0 * safe * safe)
+    series = 1.0 / 12.0 + square * (1.0 / 720.0 + square * (1.0 / 30240.0))
+    across = torch.linalg.cross(turn, vector)
+    share = torch.where(2.0 * half > _SERIES, exact, series)
+    return vector - 0.5 * across + share * torch.linalg.cross(turn, across)

@@ -77,7 +77,8 @@ class FreeMotion {
     const int first = plan_.body_start[body];
     if (!has_surface(body)) return true;
     return first >= plan_.body_vertices &&
-           !(plan_.rigid && plan_.rigid[10 * std::int64_t(plan_.collider[first])] > T(0));
+           !(plan_.rigid &&
+             plan_.rigid[rigid_numbers * std::int64_t(plan_.collider[first])] > T(0));
   }
 
   T margin() const { return T(0.5 + slack_share) * plan_.thickness; }

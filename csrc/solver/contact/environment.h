@@ -105,11 +105,11 @@ enum Limits : int { limits_none, limits_planes, limits_stuck };
 // A collider with a mass; see solver/contact/rigid.h. `weight` 0: moves by hand.
 struct RigidCollider {
   double weight;
-  Vec3<double> center;  // of mass, about its origin
-  Mat3<double> moment;  // S
-  // in an iteration: centre and J at the present pose, 1 / size, minus the derivative of E there, and the motion from it
+  Vec3<double> center;    // of mass, about its origin
+  Mat3<double> inertia;   // J
+  Vec3<double> momentum;  // L
+  // in an iteration: the centre at the present pose, 1 / size, minus the derivative of E there, and the motion from it
   Vec3<double> at;
-  Mat3<double> inertia;
   double length;
   Vec3<double> pull, torque, shift, turn;
   double energy;
@@ -298,6 +298,7 @@ struct ContactEnvironment {
   const T *poses, *goal_poses;      // [colliders, 7] at the start, and of the step's end
   const std::int64_t* history_key;  // [capacity]
   const T* history_force;           // [capacity, 4]
+  const T* rigid;                   // [colliders, 13] as in ContactPlan
 
   PD_HD bool held(int v) const { return a.held[v] != 0; }
   // components that move rigidly: those of bodies, then colliders if one has a mass

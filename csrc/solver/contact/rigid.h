@@ -1,10 +1,11 @@
 // Colliders with a mass: rigid bodies that move by inertia, weight, an applied wrench and the forces of pairs.
 //
-// With the centre of mass c, the rotation R, W = m / h^2 and S = sum a r r^T over parts of mass h^2 a with arms r, the
-// objective of a step has
-//   E(c, R) = W / 2 |c - c_goal|^2 + tr S - tr(R S Q^T).
-// Its minimum is the free motion, to c_goal and Q. At the present pose, a small shift t and turn w change it by
-//   W / 2 |t|^2 + w . J w / 2 - W (c_goal - c) . t - axis(Q S R^T) . w,   J = tr S' - S',  S' = R S R^T.
+// With the centre of mass c, the turn u (a rotation vector) since the start of the step, W = m / h^2, the angular momentum
+// h L of the free motion and its moment of inertia h^2 J (at the middle of the turn), the objective of a step has
+//   E(c, u) = W / 2 |c - c_goal|^2 + u . J u / 2 - L . u.
+// Its minimum is the free motion. At the present pose, a small shift t and turn w change it by
+//   W / 2 |t|^2 + w . J w / 2 - W (c_goal - c) . t - torque . w,   torque = V(u)^-T (L - J u),
+// V of math/screw.h. What balances the torque takes that momentum: L_next = L - torque.
 // The prox of an iteration (solver/contact/prox.h) has t and w as six more unknowns, in this metric. So no momentum acts on
 // a collider: it is where its inertia and the forces of its pairs leave it. Each sweep solves for t and w first, with forces
 // of pairs that follow them by beta. Pairs then take the motion of their corners for given.
@@ -20,11 +21,6 @@ PD_HD Pose<double> widened(const Pose<float>& a) {
   return {widened<double>(a.origin), double(a.w), widened<double>(a.axis)};
 }
 PD_HD Pose<double> widened(const Pose<double>& a) { return a; }
-
-PD_HD Mat3<double> rotation_of(const Pose<double>& pose) {
-  const Pose<double> about{{0, 0, 0}, pose.w, pose.axis};
-  return from_columns(about.place({1, 0, 0}), about.place({0, 1, 0}), about.place({0, 0, 1}));
-}
 
 // The pose after a shift of the `center`, a point of the body, and Cayley's turn about it.
 template <class T>
@@ -57,12 +53,16 @@ class RigidColliders {
   template <class Team>
   PD_HD void start(const Team& team) const {
     team.each(plan_.colliders, [&](int c) {
-      const T* const n = plan_.rigid + 10 * std::int64_t(c);
+      const T* const n = env_.rigid + rigid_numbers * std::int64_t(c);
+      const auto vector = [&](int at) {
+        return Vec3<double>{double(n[at]), double(n[at + 1]), double(n[at + 2])};
+      };
       RigidCollider& of = a_.rigid_collider[c];
       of.weight = n[0];
-      of.center = {double(n[1]), double(n[2]), double(n[3])};
-      const double s[6] = {n[4], n[5], n[6], n[7], n[8], n[9]};
-      of.moment = {{{s[0], s[1], s[2]}, {s[1], s[3], s[4]}, {s[2], s[4], s[5]}}};
+      of.center = vector(1);
+      const Vec3<double> first = vector(4), last = vector(7);
+      of.inertia = {{first, {first.y, last.x, last.y}, {first.z, last.y, last.z}}};
+      of.momentum = vector(10);
     });
     each_vertex(team, [&](int v, int c) {
       a_.held[v] = 0;
@@ -73,18 +73,29 @@ class RigidColliders {
 
   PD_HD Pose<T> free_goal(int c) const { return Hand<T>::read(env_.goal_poses + 7 * c); }
 
-  // The quadratics of a collider at a pose, as those of a body's vertices.
+  // The rotation vector from the start of the step to a pose.
+  PD_HD Vec3<double> turn_to(int c, const Pose<double>& pose) const {
+    const Pose<double> begin = widened(Hand<T>::read(env_.poses + 7 * c));
+    return rotation_vector(Quaternion<double>{pose.w, pose.axis} *
+                           Quaternion<double>{begin.w, -begin.axis});
+  }
+
+  // The quadratics of a collider at a pose, as those of a body's vertices with these derivatives.
   PD_HD RigidBody body_at(int c, const Pose<T>& pose) const {
     const RigidCollider& of = a_.rigid_collider[c];
-    const Pose<double> at = widened(pose), goal = widened(free_goal(c));
-    const Mat3<double> turn = rotation_of(at), back = transpose(turn);
+    const Pose<double> at = widened(pose);
+    const Vec3<double> turn = turn_to(c, at),
+                       torque = unmean_rotated(-turn, of.momentum - of.inertia * turn);
+    const double half = 0.5 * trace(of.inertia);
+    const Mat3<double> whole{{{half, 0, 0}, {0, half, 0}, {0, 0, half}}},
+        twist = cross_matrix(0.5 * torque);
     RigidBody body;
     body.weight = of.weight;
     body.center = at.place(of.center);
-    body.pull = of.weight * (goal.place(of.center) - body.center);
-    body.second_moment = turn * of.moment * back;
-    body.covariance = rotation_of(goal) * of.moment * back;
-    body.square = of.weight > 0 ? trace(body.second_moment) / of.weight : 0.0;
+    body.pull = of.weight * (widened(free_goal(c)).place(of.center) - body.center);
+    body.second_moment = whole - of.inertia;
+    for (int r = 0; r < 3; ++r) body.covariance.row[r] = body.second_moment.row[r] + twist.row[r];
+    body.square = of.weight > 0 ? half / of.weight : 0.0;
     return body;
   }
 
@@ -93,9 +104,12 @@ class RigidColliders {
   PD_HD double energy(const Team& team) const {
     team.each(plan_.colliders, [&](int c) {
       if (!is_rigid(c)) return;
-      const RigidBody body = body_at(c, a_.hand[c].pose);
-      a_.rigid_collider[c].energy = 0.5 * dot(body.pull, body.pull) / body.weight +
-                                    (trace(body.second_moment) - trace(body.covariance));
+      RigidCollider& of = a_.rigid_collider[c];
+      const Pose<double> pose = widened(a_.hand[c].pose);
+      const Vec3<double> way = pose.place(of.center) - widened(free_goal(c)).place(of.center),
+                         turn = turn_to(c, pose);
+      of.energy =
+          0.5 * (of.weight * dot(way, way) + dot(turn, of.inertia * turn)) - dot(of.momentum, turn);
     });
     double sum = 0;
     for (int c = 0; c < plan_.colliders; ++c)
@@ -114,7 +128,6 @@ class RigidColliders {
       RigidCollider& of = a_.rigid_collider[c];
       const RigidBody body = body_at(c, a_.hand[c].pose);
       of.at = body.center;
-      of.inertia = axis_matrix(body.second_moment);
       of.length = body.square > 0 ? 1.0 / square_root(body.square) : 1.0;
       of.pull = body.pull;
       of.torque = axis_of(body.covariance);
