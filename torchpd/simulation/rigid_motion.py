@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..common.small_matrices import dot, inverse, product
+from ..common.small_matrices import dot, inverse, length, product
 
 __all__ = ["FreeMotion", "RigidBodies", "refuse_gradients"]
 
@@ -60,7 +60,7 @@ class RigidBodies(NamedTuple):
         half, inertia = torch.zeros_like(momentum), self._at(turn)
         for _ in range(_MIDPOINT_ROUNDS):
             half = 0.5 * time_step * _times(inverse(inertia), momentum)
-            far = torch.linalg.vector_norm(half, dim=-1, keepdim=True) / _MIDDLE
+            far = length(half)[..., None] / _MIDDLE
             inertia = self._at(_rotation(_turned(half / far.clamp(min=1.0), poses[..., 3:])))
         end = _turned(time_step * _times(inverse(inertia), momentum), poses[..., 3:])
         origin = poses[..., :3] + time_step * velocity + (arm - _times(_rotation(end), self.center))
@@ -131,13 +131,13 @@ def _rotation(quaternion: Tensor) -> Tensor:
 
 def _turned(turn: Tensor, quaternion: Tensor) -> Tensor:
     """Unit quaternions turned by rotation vectors [..., 3]; without a turn the same bits."""
-    angle = 0.5 * torch.linalg.vector_norm(turn, dim=-1, keepdim=True)
+    angle = 0.5 * length(turn)[..., None]
     w, axis = torch.cos(angle), 0.5 * torch.sinc(angle / torch.pi) * turn
     own, of = quaternion[..., :1], quaternion[..., 1:]
     product_w = w * own - dot(axis, of)[..., None]
     product_axis = w * of + own * axis + torch.linalg.cross(axis, of)
     made = torch.cat([product_w, product_axis], dim=-1)
-    unit = made / torch.linalg.vector_norm(made, dim=-1, keepdim=True)
+    unit = made / (product_w * product_w + dot(product_axis, product_axis)[..., None]).sqrt()
     return torch.where(angle > 0.0, unit, quaternion)
 
 
@@ -147,7 +147,7 @@ def _turn_between(start: Tensor, end: Tensor) -> Tensor:
     own, of = end[..., :1], end[..., 1:]
     along = own * w - dot(of, axis)[..., None]
     across = own * axis + w * of + torch.linalg.cross(of, axis)
-    size = torch.linalg.vector_norm(across, dim=-1, keepdim=True)
+    size = length(across)[..., None]
     sign = torch.where(along < 0.0, -1.0, 1.0).to(start.dtype)
     angle = 2.0 * torch.atan2(size, sign * along)
     return sign * torch.where(size > 0.0, angle / size.clamp(min=torch.finfo(size.dtype).tiny), 2.0) * across
