@@ -61,7 +61,7 @@ def test_a_state_moves_as_one() -> None:
     """`to` keeps keys whole; clone, detach and where take every part."""
     sim, state, _ = resting(batch=2)
     wide = state.to(torch.float64)
-    assert [part.dtype for part in parts_of(wide)] == [torch.float64] * 3 + [torch.int64] + [torch.float64] * 2
+    assert [part.dtype for part in parts_of(wide)] == [torch.float64] * 3 + [torch.int64] + [torch.float64] * 3
     assert torch.equal(wide.history.keys, state.history.keys)
     assert same(wide.to(torch.float32), state)
     assert same(state.clone(), state)

@@ -2,14 +2,15 @@
 
 With the mass m, the centre of mass c, the rotation R and the angular momentum L about c, the free motion of a step is
 
-    c_goal = c + h V,   V = v + h (g + F / m);   Q = exp(h w) R,   w = J^-1 L_free,   L_free = L + h T,
+    c_goal = c + h V,   V = v + h (g + F / m);   Q = cay(u) R,   u = h J^-1 L_free,   L_free = L + h T.
 
-J the moment of inertia at R_mid = exp(h w / 2) R: the midpoint rule, which keeps L_free. Its turn counts up to half a
-radian. A step ends at c' and exp(u) R (csrc/solver/contact/rigid.h). It leaves
+cay(u) turns about u by 2 atan(|u| / 2). J is the moment of inertia at the middle of that turn: the midpoint rule, which
+keeps L_free. A step ends at c' and cay(u) R (csrc/solver/contact/rigid.h). It leaves
 
-    v' = V + (c' - c_goal) / h,   L' = L_free - V(u)^-T (L_free - J u / h),   V(u) = int_0^1 exp(s [u]) ds.
+    v' = V + (c' - c_goal) / h,   L' = L_free - (1 + [u] / 2 + u u^T / 4) (L_free - J u / h).
 
 Once converged, m (v' - V) = h f and L' - L_free = h t, with the force f and the torque t of contact at the end.
+All is made of sums, products, quotients and roots: others have other bits in vectors than alone.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from ..common.small_matrices import dot, inverse, length, product
 
 __all__ = ["FreeMotion", "RigidBodies", "refuse_gradients"]
 
-_MIDPOINT_ROUNDS = 12  # each takes off a factor of at most half of the turn
-_MIDDLE = 0.5  # rad, most turn to the middle
-_SERIES = 0.1  # rad, below which quotients of differences would cancel
+_MIDPOINT_ROUNDS = 12  # each takes off a factor of about half of the turn
+_MIDDLE = 1.0  # most |u| of which the middle is taken
+_HALF_TURN = 1e-9  # least cosine of half of a turn
 
 
 class FreeMotion(NamedTuple):
@@ -57,11 +58,12 @@ class RigidBodies(NamedTuple):
             force, torque = wrenches[..., :3], wrenches[..., 3:]
             velocity = velocity + (time_step / self.mass) * force
             momentum = momentum + time_step * (torque - torch.linalg.cross(arm, force))
-        half, inertia = torch.zeros_like(momentum), self._at(turn)
+        inertia = self._at(turn)
         for _ in range(_MIDPOINT_ROUNDS):
-            half = 0.5 * time_step * _times(inverse(inertia), momentum)
-            far = length(half)[..., None] / _MIDDLE
-            inertia = self._at(_rotation(_turned(half / far.clamp(min=1.0), poses[..., 3:])))
+            by = time_step * _times(inverse(inertia), momentum)
+            by = by / (length(by)[..., None] / _MIDDLE).clamp(min=1.0)
+            # the mean of two unit quaternions is half way
+            inertia = self._at(_rotation(poses[..., 3:] + _turned(by, poses[..., 3:])))
         end = _turned(time_step * _times(inverse(inertia), momentum), poses[..., 3:])
         origin = poses[..., :3] + time_step * velocity + (arm - _times(_rotation(end), self.center))
         return FreeMotion(torch.cat([origin, end], dim=-1), velocity, momentum, inertia)
@@ -79,7 +81,8 @@ class RigidBodies(NamedTuple):
         goal, end = _rotation(free.poses[..., 3:]), _rotation(poses[..., 3:])
         left = (poses[..., :3] - free.poses[..., :3]) + (_times(end, self.center) - _times(goal, self.center))
         turn = _turn_between(before[..., 3:], poses[..., 3:])
-        taken = _unmean_rotated(-turn, free.momentum - _times(free.inertia, turn) / time_step)
+        rest = free.momentum - _times(free.inertia, turn) / time_step
+        taken = rest + 0.5 * torch.linalg.cross(turn, rest) + 0.25 * dot(turn, rest)[..., None] * turn
         # to the bit where nothing was in the way, and for any turn
         arrived = (poses == free.poses).all(dim=-1, keepdim=True)
         momentum = torch.where(arrived, free.momentum, free.momentum - taken)
@@ -130,36 +133,19 @@ def _rotation(quaternion: Tensor) -> Tensor:
 
 
 def _turned(turn: Tensor, quaternion: Tensor) -> Tensor:
-    """Unit quaternions turned by rotation vectors [..., 3]; without a turn the same bits."""
-    angle = 0.5 * length(turn)[..., None]
-    w, axis = torch.cos(angle), 0.5 * torch.sinc(angle / torch.pi) * turn
-    own, of = quaternion[..., :1], quaternion[..., 1:]
-    product_w = w * own - dot(axis, of)[..., None]
-    product_axis = w * of + own * axis + torch.linalg.cross(axis, of)
-    made = torch.cat([product_w, product_axis], dim=-1)
-    unit = made / (product_w * product_w + dot(product_axis, product_axis)[..., None]).sqrt()
-    return torch.where(angle > 0.0, unit, quaternion)
+    """Unit quaternions turned by Cayley's vectors [..., 3]; without a turn the same bits."""
+    own, of, axis = quaternion[..., :1], quaternion[..., 1:], 0.5 * turn
+    w = own - dot(axis, of)[..., None]
+    across = of + own * axis + torch.linalg.cross(axis, of)
+    size = (w * w + dot(across, across)[..., None]).sqrt()
+    turns = (turn != 0.0).any(dim=-1, keepdim=True)
+    return torch.where(turns, torch.cat([w, across], dim=-1) / size, quaternion)
 
 
 def _turn_between(start: Tensor, end: Tensor) -> Tensor:
-    """Rotation vectors [..., 3] of the smaller turn from one unit quaternion to another."""
+    """Cayley's vectors [..., 3] of the smaller turn from one unit quaternion to another."""
     w, axis = start[..., :1], -start[..., 1:]
     own, of = end[..., :1], end[..., 1:]
     along = own * w - dot(of, axis)[..., None]
     across = own * axis + w * of + torch.linalg.cross(of, axis)
-    size = length(across)[..., None]
-    sign = torch.where(along < 0.0, -1.0, 1.0).to(start.dtype)
-    angle = 2.0 * torch.atan2(size, sign * along)
-    return sign * torch.where(size > 0.0, angle / size.clamp(min=torch.finfo(size.dtype).tiny), 2.0) * across
-
-
-def _unmean_rotated(turn: Tensor, vector: Tensor) -> Tensor:
-    """V(turn)^-1 vector, as csrc/math/screw.h."""
-    square = dot(turn, turn)[..., None]
-    half = 0.5 * square.sqrt()
-    safe = torch.where(2.0 * half > _SERIES, half, torch.ones_like(half))
-    exact = (1.0 - safe / torch.tan(safe)) / (4.0 * safe * safe)
-    series = 1.0 / 12.0 + square * (1.0 / 720.0 + square * (1.0 / 30240.0))
-    across = torch.linalg.cross(turn, vector)
-    share = torch.where(2.0 * half > _SERIES, exact, series)
-    return vector - 0.5 * across + share * torch.linalg.cross(turn, across)
+    return torch.where(along < 0.0, -2.0, 2.0).to(start.dtype) * across / along.abs().clamp(min=_HALF_TURN)

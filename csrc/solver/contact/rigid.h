@@ -1,11 +1,12 @@
 // Colliders with a mass: rigid bodies that move by inertia, weight, an applied wrench and the forces of pairs.
 //
-// With the centre of mass c, the turn u (a rotation vector) since the start of the step, W = m / h^2, the angular momentum
-// h L of the free motion and its moment of inertia h^2 J (at the middle of the turn), the objective of a step has
+// With the centre of mass c, the turn u since the start of the step (Cayley's vector, along the axis by 2 tan(angle / 2)),
+// W = m / h^2, the angular momentum h L of the free motion and its moment of inertia h^2 J (at the middle of the turn), the
+// objective of a step has
 //   E(c, u) = W / 2 |c - c_goal|^2 + u . J u / 2 - L . u.
 // Its minimum is the free motion. At the present pose, a small shift t and turn w change it by
-//   W / 2 |t|^2 + w . J w / 2 - W (c_goal - c) . t - torque . w,   torque = V(u)^-T (L - J u),
-// V of math/screw.h. What balances the torque takes that momentum: L_next = L - torque.
+//   W / 2 |t|^2 + w . J w / 2 - W (c_goal - c) . t - torque . w,   torque = (1 + [u] / 2 + u u^T / 4) (L - J u).
+// What balances the torque takes that momentum: L_next = L - torque.
 // The prox of an iteration (solver/contact/prox.h) has t and w as six more unknowns, in this metric. So no momentum acts on
 // a collider: it is where its inertia and the forces of its pairs leave it. Each sweep solves for t and w first, with forces
 // of pairs that follow them by beta. Pairs then take the motion of their corners for given.
@@ -16,6 +17,7 @@ namespace pd::inline PD_TARGET {
 
 // Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
 constexpr double rigid_yield = 1e-3;
+constexpr double half_turn = 1e-9;  // least cosine of half of a turn
 
 PD_HD Pose<double> widened(const Pose<float>& a) {
   return {widened<double>(a.origin), double(a.w), widened<double>(a.axis)};
@@ -73,19 +75,22 @@ class RigidColliders {
 
   PD_HD Pose<T> free_goal(int c) const { return Hand<T>::read(env_.goal_poses + 7 * c); }
 
-  // The rotation vector from the start of the step to a pose.
+  // Cayley's vector of the turn from the start of the step to a pose.
   PD_HD Vec3<double> turn_to(int c, const Pose<double>& pose) const {
     const Pose<double> begin = widened(Hand<T>::read(env_.poses + 7 * c));
-    return rotation_vector(Quaternion<double>{pose.w, pose.axis} *
-                           Quaternion<double>{begin.w, -begin.axis});
+    const Quaternion<double> q =
+        Quaternion<double>{pose.w, pose.axis} * Quaternion<double>{begin.w, -begin.axis};
+    const double w = absolute(q.w), sign = q.w < 0 ? -2.0 : 2.0;
+    return (sign / (w > half_turn ? w : half_turn)) * q.axis;
   }
 
   // The quadratics of a collider at a pose, as those of a body's vertices with these derivatives.
   PD_HD RigidBody body_at(int c, const Pose<T>& pose) const {
     const RigidCollider& of = a_.rigid_collider[c];
     const Pose<double> at = widened(pose);
-    const Vec3<double> turn = turn_to(c, at),
-                       torque = unmean_rotated(-turn, of.momentum - of.inertia * turn);
+    const Vec3<double> turn = turn_to(c, at), left = of.momentum - of.inertia * turn,
+                       torque = multiply_add(0.25 * dot(turn, left), turn,
+                                             multiply_add(0.5, cross(turn, left), left));
     const double half = 0.5 * trace(of.inertia);
     const Mat3<double> whole{{{half, 0, 0}, {0, half, 0}, {0, 0, half}}},
         twist = cross_matrix(0.5 * torque);
