@@ -33,6 +33,7 @@ enum ContactArray : int {
   contact_local,
   contact_cell,
   contact_friction,
+  contact_rigid,
   contact_thickness,
   contact_array_count
 };
@@ -111,6 +112,9 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
                     " bodies, got ", describe(arrays[contact_friction]),
                     "; compile the scene again");
   plan.friction = arrays[contact_friction].const_data_ptr<T>();
+  const std::int64_t rigid = rows_of_array(contact_rigid);
+  const T* const numbers = reals(contact_rigid, rigid, rigid_numbers, "masses of colliders");
+  plan.rigid = rigid > 0 ? numbers : nullptr;
   // a number of the host, as sizes
   check_array(arrays[contact_thickness], scalar_type<T>, 1, 1, {at::kCPU, "every plan's thickness"},
               "contact", "thickness [m]");
@@ -160,6 +164,9 @@ ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at:
   check(history[0], real, {b, c, 7}, "history.poses", "actual poses of colliders");
   check(history[1], at::kLong, {b, m}, "history.keys", "pairs with forces");
   check(history[2], real, {b, m, 4}, "history.forces", "N");
+  const std::int64_t rigid = contact[contact_rigid].size(0);
+  TORCH_CHECK_VALUE(rigid == 0 || rigid == b * c, "contact must have masses of ", b * c,
+                    " colliders or of none, got ", rigid, " rows");
   const Tensor info = at::empty({b, contact_info_count}, x.options().dtype(at::kDouble)),
                held = at::empty({b, c}, x.options()),
                next_poses = at::empty({b, c, 7}, x.options()),

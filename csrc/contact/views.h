@@ -4,6 +4,8 @@
 
 namespace pd {
 
+constexpr int rigid_numbers = 13;
+
 // The constant arrays of a scene with contact. Vertices have the user's numbers, those of bodies first.
 template <class T>
 struct ContactPlan {
@@ -21,6 +23,9 @@ struct ContactPlan {
   // no vertex, or 0
   const T *rest, *rest_apart;
   const T *local, *cell, *friction;  // [vertices, 3] of colliders; [vertices]; [bodies, bodies]
+  // [batch, colliders, 13] m / h^2, centre of mass, moment of inertia over h^2 (xx xy xz yy yz zz) and angular momentum over
+  // h, about that centre in world axes; 0 for colliders without a mass; null if none has
+  const T* rigid = nullptr;
   int vertices = 0, body_vertices = 0, triangles = 0, edges = 0, points = 0, bodies = 0,
       colliders = 0, capacity = 0, clusters = 0, point_clusters = 0, edge_clusters = 0;
   std::int64_t rest_pairs = 0;
@@ -55,11 +60,12 @@ template <class T>
 struct ContactCall {
   ContactPlan<T> plan;
   ContactHistory<T> history;
-  const T* poses;  // [batch, colliders, 7] at the step's end
-  double* info;    // [batch, contact_info_count]
-  T* held_back;    // [batch, colliders] m
-  T* forces;       // [batch, vertices, 3] N of contact on every vertex at the end of the step
-  bool report;     // whether the residual is wanted
+  const T*
+      poses;  // [batch, colliders, 7] at the step's end; of colliders with a mass, at that of their free motion
+  double* info;  // [batch, contact_info_count]
+  T* held_back;  // [batch, colliders] m
+  T* forces;     // [batch, vertices, 3] N of contact on every vertex at the end of the step
+  bool report;   // whether the residual is wanted
 };
 
 }  // namespace pd

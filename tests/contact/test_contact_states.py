@@ -44,13 +44,14 @@ def test_the_state_at_rest() -> None:
     assert isinstance(state, pd.HistoryState)
     assert isinstance(state.history, pd.ContactHistory)
     count = 16 * len(sim.body_contact.plan.triangles)  # type: ignore[union-attr]
-    poses, keys, forces, flow = state.history
+    poses, keys, forces, motion, flow = state.history
     assert torch.equal(poses, torch.tensor([1.0, 0, 0, 0]).repeat(3, 2, 1)[..., [1, 2, 3, 0, 1, 2, 3]])
     assert keys.shape == (3, count)
     assert keys.dtype == torch.int64
     assert bool((keys == -1).all())
     assert forces.shape == (3, count, 4)
     assert not forces.any()
+    assert motion.shape == (3, 0, 6)
     assert flow.shape == (3, 0, 10)
     assert repr(state.history) == f"ContactHistory(batch=3, pairs={count}, float32, cpu)"
     assert len(scene.colliders) == 2
@@ -60,7 +61,7 @@ def test_a_state_moves_as_one() -> None:
     """`to` keeps keys whole; clone, detach and where take every part."""
     sim, state, _ = resting(batch=2)
     wide = state.to(torch.float64)
-    assert [part.dtype for part in parts_of(wide)] == [torch.float64] * 3 + [torch.int64] + [torch.float64] * 2
+    assert [part.dtype for part in parts_of(wide)] == [torch.float64] * 3 + [torch.int64] + [torch.float64] * 3
     assert torch.equal(wide.history.keys, state.history.keys)
     assert same(wide.to(torch.float32), state)
     assert same(state.clone(), state)

@@ -219,6 +219,14 @@ def test_train_pusher(run) -> None:
     numbers(text, r"memory: (\S+) GiB")
 
 
+@pytest.mark.parametrize("mass", ["0.05", "0.002"])
+def test_light_finger(run, mass: str) -> None:
+    text = run("light_finger.py", "--steps", "32", "--mass", mass)
+    carried, load, held, drag = numbers(text, r"carries (\S+) N of (\S+) N, and holds (\S+) N of (\S+) N")
+    assert carried == pytest.approx(load, rel=2e-3)
+    assert held == pytest.approx(drag, rel=2e-2)
+
+
 def test_push_by_collider(run) -> None:
     text = run("push_by_collider.py", "--steps", "10", "--tries", "4")
     distances = [float(number) for number in re.findall(r"^ +\d+ +(\S+)$", text, flags=re.MULTILINE)]

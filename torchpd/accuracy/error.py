@@ -131,7 +131,9 @@ class ExactStep:
 
 def scene_without_friction(scene: Scene) -> Scene:
     """The same parts, with frictionless planes, spheres, colliders and contact."""
-    twins: dict[int, Any] = {id(part): Collider(part.mesh, pose=part.pose) for part in scene.colliders}
+    twins: dict[int, Any] = {
+        id(part): Collider(part.mesh, pose=part.pose, mass=part.mass, inertia=part.inertia) for part in scene.colliders
+    }
     parts: list[Part] = []
     for part in scene.parts:
         if isinstance(part, Ground):

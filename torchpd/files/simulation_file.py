@@ -56,7 +56,17 @@ _KINDS: dict[str, type[Any]] = {kind.__name__: kind for kind in _PARTS}
 _SOLVERS: dict[str, type[Solver]] = {kind.__name__: kind for kind in (Jacobi, Chebyshev, Multilevel, Newton)}
 _BODIES = {"body", "other", "solid"}  # fields that hold a body of the scene
 # fields that the first files of format 2 lack
-_LATER = {"poisson", "averaging", "law", "strain_limit", "limit_stiffness", "stiffness_damping", "plastic"}
+_LATER = {
+    "poisson",
+    "averaging",
+    "law",
+    "strain_limit",
+    "limit_stiffness",
+    "stiffness_damping",
+    "plastic",
+    "mass",
+    "inertia",
+}
 # inputs of a preconditioner, which with the mesh determine its bits
 _REFERENCE = ("stiffness", "inertia")
 _DTYPES = {str(dtype).removeprefix("torch."): dtype for dtype in (torch.float32, torch.float64)}

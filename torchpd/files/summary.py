@@ -135,8 +135,10 @@ def _effect_lines(sim: Stepper) -> list[str]:
     if sim.body_contact is not None:
         plan = sim.body_contact.plan
         rigid, taking = len(plan.poses), len(np.unique(plan.body[plan.edges[:, 0]]))
+        moved = sum(of is not None for of in plan.rigid)
+        masses = f", {moved} of them with a mass" if moved else ""
         lines.append(
-            f"contact: {taking - rigid} bodies, {rigid} colliders ({len(plan.triangles)} triangles, "
+            f"contact: {taking - rigid} bodies, {rigid} colliders{masses} ({len(plan.triangles)} triangles, "
             f"{len(plan.edges)} edges), thickness {plan.thickness:.3g} m, up to {plan.capacity} pairs in each "
             f"environment{', more when needed' if plan.grows else ''}"
         )

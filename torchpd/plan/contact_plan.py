@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..scene.contact import ContactValues, placed
+from ..scene.rigid import RigidMass
 from ..scene.scene import SceneValues
 from .contact_near import NearPairs, Primitives, least_apart, near_pairs, own_vertices
 from .contact_tree import ContactTree
@@ -38,10 +39,11 @@ class ContactPlan:
     edges: Numbers  # [E, 2] of triangles and rods, each once, in increasing order
     vertices: Numbers  # [S] ends of the edges, increasing
     body: Numbers  # [N] number of the body of each vertex
-    kinematic: Mask  # [N] whether the scene moves the vertex by hand: hard pins and colliders
+    kinematic: Mask  # [N] whether the scene moves the vertex by hand: hard pins and colliders without a mass
     collider: Numbers  # [N] number of its collider, -1 for vertices that deform
     points: Array  # [N - V, 3] m, vertices of colliders about the origins of their poses
     poses: Array  # [C, 7] of the colliders at the start
+    rigid: tuple[RigidMass | None, ...]  # [C] of colliders with a mass
     cell: Array  # [N] m, mean length of the edges of the vertex's body; 0 where it takes no part
     friction: Array  # [Q, Q] Coulomb's coefficient between bodies
     self_contact: Mask  # [Q] whether parts of a body meet
@@ -113,7 +115,8 @@ def contact_plan(values: SceneValues) -> ContactPlan:
     _check_triangles(given, surface, thickness)
     parts = len(given.triangles) + len(given.segments)
     capacity = _PAIRS_PER_PART * parts if given.capacity is None else given.capacity
-    kinematic = given.collider >= 0
+    by_hand = np.array([True, *(mass is None for mass in given.rigid)])
+    kinematic = (given.collider >= 0) & by_hand[given.collider + 1]
     kinematic[values.pin_vertices[np.isinf(values.pin_stiffness)]] = True
     tied = _tied(values)
     solid = np.array([kind == "Solid" for kind in given.kinds]) & given.self_contact
@@ -127,6 +130,7 @@ def contact_plan(values: SceneValues) -> ContactPlan:
         collider=given.collider.astype(np.int32),
         points=given.points,
         poses=given.poses,
+        rigid=given.rigid,
         cell=mean[given.body],
         friction=given.friction,
         self_contact=given.self_contact,

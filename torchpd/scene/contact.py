@@ -1,4 +1,4 @@
-"""Contact of bodies with each other, with themselves, and with rigid surfaces that move by hand."""
+"""Contact of bodies with each other, with themselves, and with rigid surfaces."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ from ..common.synonyms import check_arguments
 from ..geometry.tet_mesh import TetMesh
 from ..geometry.tri_mesh import TriMesh
 from .part import ArrayLike, Body, KeyPart, set_fields, unit_vectors
+from .rigid import RigidMass, rigid_mass
 from .rod import Polyline
 
-__all__ = ["Collider", "Contact", "ContactValues", "contact_values", "placed"]
+__all__ = ["Collider", "Contact", "ContactValues", "can_touch", "contact_values", "placed"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -27,16 +28,24 @@ _STILL = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 @dataclass(eq=False, repr=False)
 class Collider(KeyPart):
-    """A rigid surface of triangles that moves by hand, for `Contact`.
+    """A rigid surface of triangles, for `Contact`: moved by hand, or with `mass` by forces.
 
-    Both sides of a triangle keep bodies away, so the surface may be open. Colliders do not touch each other. Steps take
-    `targets={collider: pose}`, a pose [7] or [B, 7] at their end; without one the collider stays.
+    Both sides of a triangle keep bodies away, so the surface may be open. Steps take `targets={collider: pose}`, a pose
+    [7] or [B, 7] at their end; without one the collider stays. Colliders without a mass do not touch each other.
+
+    With a mass the collider moves by gravity, contact and an applied wrench: steps take `targets={collider: wrench}`
+    [6] or [B, 6], force [N] and torque [N m] about its origin, in world axes; without one it is zero. Its velocity is
+    `state.history.motion`. `Ground` and `Sphere` do not act on it: docs/contact.md#colliders-with-a-mass.
 
     Args:
         mesh: a `TriMesh`, or a `TetMesh` whose boundary is taken, with coordinates [m] about the origin of the pose.
         friction: Coulomb's coefficient, >= 0; None: that of the other side, see `Contact`.
         pose: at the start, (x, y, z, qw, qx, qy, qz): the origin in the world [m], and a quaternion, normalised here.
             None: where the mesh is.
+        mass: positive [kg]; None: it moves by hand.
+        inertia: with a mass, about its centre of mass in the axes of the mesh [kg m^2]: [3, 3], or three moments about
+            the axes. None: that of a uniform body inside a closed surface. The centre is that of the enclosed volume,
+            or of the area of an open surface.
 
     Example:
         >>> finger = Collider(torchpd.shapes.box((0.02, 0.1, 0.02), (1, 5, 1)), friction=0.8)
@@ -45,10 +54,18 @@ class Collider(KeyPart):
     mesh: TriMesh
     friction: float | None
     pose: Array  # [7]
+    mass: float | None
+    inertia: Array | None  # [3, 3]
 
     @check_arguments("Collider")
     def __init__(
-        self, mesh: TriMesh | TetMesh, *, friction: float | None = None, pose: ArrayLike | None = None
+        self,
+        mesh: TriMesh | TetMesh,
+        *,
+        friction: float | None = None,
+        pose: ArrayLike | None = None,
+        mass: float | None = None,
+        inertia: ArrayLike | None = None,
     ) -> None:
         if not isinstance(mesh, TriMesh | TetMesh):
             raise TypeError(
@@ -58,12 +75,22 @@ class Collider(KeyPart):
         if isinstance(mesh, TetMesh):
             kept, numbers = np.unique(mesh.boundary(), return_inverse=True)
             mesh = TriMesh(mesh.vertices[kept], numbers.reshape(-1, 3))
+        if mass is None and inertia is not None:
+            raise ValueError("Collider.inertia must come with a mass, got mass=None; give mass= in kg, or leave it out")
+        rigid = None if mass is None else rigid_mass(mesh, mass, inertia)
         set_fields(
             self,
             mesh=mesh,
             friction=None if friction is None else check_scalar("Collider.friction", friction, minimum=0.0),
             pose=_pose(_STILL if pose is None else pose),
+            mass=None if rigid is None else rigid.mass,
+            inertia=None if rigid is None else rigid.inertia,
         )
+
+    @property
+    def rigid(self) -> RigidMass | None:
+        """Mass, centre of mass and inertia; None without a mass."""
+        return None if self.mass is None else rigid_mass(self.mesh, self.mass, self.inertia)
 
 
 def _pose(value: ArrayLike) -> Array:
@@ -180,12 +207,17 @@ class Contact(KeyPart):
                     "that is not among them; name it too"
                 )
         for one, other in self.friction if isinstance(self.friction, Mapping) else ():
-            if not self.touches_itself(one) if one is other else not isinstance(one, Body) | isinstance(other, Body):
+            if not (self.touches_itself(one) if one is other else can_touch(one, other)):
                 names = f"{type(one).__name__}, {type(other).__name__}"
                 raise ValueError(
-                    f"Contact.friction must name pairs that can touch, got ({names}), which cannot: colliders do not "
-                    "touch each other, nor a body itself without self_contact; leave the pair out"
+                    f"Contact.friction must name pairs that can touch, got ({names}), which cannot: colliders without "
+                    "a mass do not touch each other, nor a body itself without self_contact; leave the pair out"
                 )
+
+
+def can_touch(one: Member, other: Member) -> bool:
+    """Whether one of two members moves by forces."""
+    return any(isinstance(part, Body) or part.mass is not None for part in (one, other))
 
 
 def _check_member(name: str, body: object) -> None:
@@ -252,6 +284,7 @@ class ContactValues:
     collider: Index  # [N] number of its collider, -1 for vertices that deform
     points: Array  # [N - V, 3] m, vertices of colliders about the origins of their poses
     poses: Array  # [C, 7] of the colliders at the start
+    rigid: tuple[RigidMass | None, ...]  # [C] None: moves by hand
     friction: Array  # [Q, Q] Coulomb's coefficient between bodies
     self_contact: Mask  # [Q] whether parts of a body meet
     thickness: float | None  # m; None: by the mesh
@@ -275,6 +308,7 @@ def contact_values(contact: Contact, bodies: Sequence[Body], colliders: Sequence
         collider=np.where(body < len(bodies), -1, body - len(bodies)),
         points=np.concatenate([np.zeros((0, 3)), *(part.mesh.vertices for part in colliders)]),
         poses=np.array([part.pose for part in colliders]).reshape(-1, 7),
+        rigid=tuple(part.rigid for part in colliders),
         friction=_table(contact, parts),
         self_contact=np.array(selves),
         thickness=contact.thickness,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from ..common.tables import SPHERES
 from .scene import Scene
 
-__all__ = ["Anchors", "Targets"]
+__all__ = ["NO_INPUTS", "Anchors", "ColliderInputs", "Targets"]
 
 Array = NDArray[np.float64]
 Targets = Tensor | Mapping[Any, Tensor]
@@ -42,6 +42,16 @@ def _check_precision(name: str, value: Tensor, like: Tensor) -> None:
         # half precision is refused even within autocast, unlike for forces
         half = "; in half precision they would be off by millimetres" if value.dtype.itemsize == 2 else ""
         raise TypeError(f"{name} must be {like.dtype} on {like.device}, got {value.dtype} on {value.device}{half}")
+
+
+class ColliderInputs(NamedTuple):
+    """What moves colliders in a step."""
+
+    poses: Tensor | None  # [B, C, 7] at the end, of those without a mass; None: they stay
+    wrenches: Tensor | None  # [B, C, 6] N, N m about the origin, on those with a mass; None: zero
+
+
+NO_INPUTS = ColliderInputs(None, None)
 
 
 class Anchors:
@@ -132,10 +142,23 @@ class Anchors:
                 placed["wind"] = self._checked("targets of a Wind", value, batch, [(3,)], placed["wind"], fix)
         return placed
 
+    def place_wrenches(self, targets: Targets | None, poses: Tensor) -> Tensor | None:
+        """Wrenches [B, C, 6] on colliders with a mass, from `targets`; None without one."""
+        given = targets if isinstance(targets, Mapping) else {}
+        pushed = {part: value for part, value in given.items() if id(part) in self.colliders and part.mass is not None}
+        if not pushed:
+            return None
+        wrenches = poses.new_zeros((*poses.shape[:2], 6))
+        for part, value in pushed.items():
+            value = self._checked("targets of a Collider with a mass", value, len(poses), [(6,)], poses)
+            number = self.colliders[id(part)]
+            wrenches = _overwrite(wrenches, slice(number, number + 1), value.unsqueeze(-2), -2)
+        return wrenches
+
     def place_colliders(self, targets: Targets | None, poses: Tensor) -> Tensor | None:
         """Poses of the colliders [B, C, 7] with `targets` put in, quaternions normalised; None without a target."""
         given = targets if isinstance(targets, Mapping) else {}
-        moved = {part: value for part, value in given.items() if id(part) in self.colliders}
+        moved = {part: value for part, value in given.items() if id(part) in self.colliders and part.mass is None}
         for part, value in moved.items():
             value = self._checked("targets of a Collider", value, len(poses), [(7,)], poses)
             length = value[..., 3:].norm(dim=-1, keepdim=True)

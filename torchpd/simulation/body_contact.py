@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,14 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..ops.fake_kernels import CONTACT_FRICTION
+from ..ops.diagonal import named_material
+from ..ops.fake_kernels import CONTACT_FRICTION, CONTACT_RIGID
 from ..plan.contact_clusters import contact_clusters
 from ..plan.contact_plan import ContactPlan, contact_plan
 from ..plan.contact_start import check_start
 from ..plan.contact_tree import FAN_OUT
 from ..scene.contact import placed
+from ..scene.rigid import RigidMass
 from ..scene.scene import SceneValues
+from ..scene.targets import ColliderInputs
 from .pair_forces import ContactSurfaces
+from .rigid_motion import RigidBodies, refuse_gradients
 from .state import ContactHistory, HistoryState, State, widened
 
 __all__ = ["BodyContact"]
@@ -25,6 +30,7 @@ _ops = torch.ops.torchpd
 _MISSING, _PINS_HELD_BACK, _UNBALANCED = 1, 2, 3  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 _CAPACITY = 2  # place among the sizes of the op
+_RIGID_NUMBERS = 13  # rigid_numbers in csrc/contact/views.h: filled in by steps, of scenes with such colliders alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +39,8 @@ class BodyContact:
 
     plan: ContactPlan
     arrays: list[Tensor]  # of the op, csrc/binding/contact_ops.h
-    history: tuple[Tensor, Tensor, Tensor]  # poses, keys and forces of a new state, without a batch
+    history: tuple[Tensor, Tensor, Tensor, Tensor]  # poses, keys, forces and motion of a new state, without a batch
+    rigid: RigidBodies | None  # None if no collider has a mass
 
     @staticmethod
     def of(values: SceneValues, dtype: torch.dtype) -> BodyContact:
@@ -75,15 +82,19 @@ class BodyContact:
         poses = torch.tensor(plan.poses, dtype=dtype, device=device).reshape(-1, 7)
         keys = torch.tensor(-1, device=device).expand(plan.capacity)
         forces = torch.zeros((), dtype=dtype, device=device).expand(plan.capacity, 4)
-        return BodyContact(plan, _arrays(plan, dtype, device), (poses, keys, forces))
+        rigid = _rigid_bodies(plan, dtype, device)
+        motion = poses.new_zeros((0 if rigid is None else len(poses), 6))
+        return BodyContact(plan, _arrays(plan, dtype, device), (poses, keys, forces, motion), rigid)
 
     def with_capacity(self, capacity: int) -> BodyContact:
         """The same with room for another number of pairs in an environment."""
         sizes = self.arrays[0].clone()
         sizes[_CAPACITY] = capacity
-        poses, keys, forces = self.history
-        history = poses, keys[:1].expand(capacity), forces[:1].expand(capacity, 4)
-        return BodyContact(replace(self.plan, capacity=capacity), [sizes, *self.arrays[1:]], history)
+        poses, keys, forces, motion = self.history
+        history = poses, keys[:1].expand(capacity), forces[:1].expand(capacity, 4), motion
+        return replace(
+            self, plan=replace(self.plan, capacity=capacity), arrays=[sizes, *self.arrays[1:]], history=history
+        )
 
     def check_eager(self, name: str) -> None:
         """Refuse `torch.compile` and CUDA graphs where a step reads how many pairs there are."""
@@ -103,7 +114,7 @@ class BodyContact:
         state: State | HistoryState,
         forces: Tensor | None,
         given: Tensor | None,
-        poses: Tensor | None,
+        inputs: ColliderInputs,
         material: list[Tensor],
         plan: list[Tensor],
         settings: dict[str, Any],
@@ -114,7 +125,7 @@ class BodyContact:
             state: a checked one, whose flow is in the material.
             forces: on the vertices [B, V, 3] N.
             given: first iterate, which is refused.
-            poses: of colliders at the end of the step [B, C, 7]; None: they stay.
+            inputs: what moves colliders.
             material: in the order of the ops.
             plan: arrays of the compiled scene.
             settings: of a step, by name.
@@ -127,28 +138,39 @@ class BodyContact:
         self.check_transforms(state[0], state[1], *material)
         before = widened(ContactHistory(*state[2]), self.plan.capacity)  # type: ignore[misc]
         history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.detach().contiguous()]
-        wanted = history[0] if poses is None else poses.contiguous()
+        wanted, time_step = history[0] if inputs.poses is None else inputs.poses.contiguous(), settings["time_step"]
+        arrays, motion, rigid = self.arrays, before.motion, self.rigid
+        if rigid is not None:
+            gravity = named_material(material)["gravity"]
+            free = rigid.free_motion(history[0], motion, inputs.wrenches, gravity, time_step)
+            wanted = torch.where(rigid.is_rigid, free.poses, wanted)
+            arrays = list(arrays)
+            arrays[CONTACT_RIGID] = rigid.rows(free, time_step)
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
-            state[0], state[1], forces, wanted, history, material, plan, self.arrays, **settings
+            state[0], state[1], forces, wanted, history, material, plan, arrays, **settings
         )
+        missing = (numbers[:, _MISSING] > 0)[:, None, None]
+        if rigid is not None:
+            motion = torch.where(missing, motion, rigid.motion_after(free, history[0], actual, time_step))
+            positions, velocities, actual, motion = refuse_gradients(positions, velocities, actual, motion)
         flow = before.flow
         if flow.shape[-2]:
-            (after,) = _ops.next_history(positions, material, plan, time_step=settings["time_step"])
+            (after,) = _ops.next_history(positions, material, plan, time_step=time_step)
             # the step of an environment whose pairs exceed the capacity is taken back
-            flow = torch.where((numbers[:, _MISSING] > 0)[:, None, None], flow, after)
+            flow = torch.where(missing, flow, after)
         held_back = numbers[:, _PINS_HELD_BACK:_UNBALANCED]
         if held.shape[1]:
             held_back = torch.cat([held_back, held.double()], dim=1).amax(dim=1, keepdim=True)
         # the residual of other scenes would count forces between bodies as unbalanced
         unbalanced, gaps = numbers[:, _UNBALANCED : _UNBALANCED + 1], numbers[:, :_PINS_HELD_BACK]
         rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back], dim=1)
-        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, flow)), rows
+        return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, motion, flow)), rows
 
     @property
     def surfaces(self) -> ContactSurfaces:
         """What forces between surfaces are read by."""
         triangles, edges, _, body, collider = self.arrays[1:6]
-        points, cell, _, thickness = self.arrays[14:]
+        points, cell, _, _, thickness = self.arrays[14:]
         return ContactSurfaces(triangles, edges, body, collider, points, cell, thickness.to(points.device))
 
     @staticmethod
@@ -199,7 +221,23 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     search = [clusters.leaves.reshape(-1, FAN_OUT), clusters.body, np.stack(starts)]
     rest = [plan.near.thickness, plan.shape, plan.apart]
-    reals = [*rest, plan.points.reshape(-1, 3), plan.cell, plan.friction]
+    reals = [*rest, plan.points.reshape(-1, 3), plan.cell, plan.friction, np.zeros((0, _RIGID_NUMBERS))]
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     moved = [array.to(device) for array in (*map(whole, [*surfaces, *search]), keys, *map(real, reals))]
     return [sizes, *moved, real([plan.thickness])]
+
+
+def _rigid_bodies(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> RigidBodies | None:
+    if not any(plan.rigid):
+        return None
+
+    def stacked(of: Callable[[RigidMass], Any], otherwise: Any) -> Tensor:
+        values = np.array([otherwise if one is None else of(one) for one in plan.rigid])
+        return torch.tensor(values, dtype=dtype, device=device)
+
+    return RigidBodies(
+        torch.tensor([[one is not None] for one in plan.rigid], device=device),
+        stacked(lambda of: [of.mass], [1.0]),
+        stacked(lambda of: of.center, np.zeros(3)),
+        stacked(lambda of: of.inertia, np.eye(3)),
+    )

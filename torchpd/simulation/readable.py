@@ -20,7 +20,7 @@ from ..scene.fibres import Fibres
 from ..scene.part import Body
 from ..scene.rod import Rod
 from ..scene.springs import Springs
-from ..scene.targets import Targets
+from ..scene.targets import NO_INPUTS, ColliderInputs, Targets
 from .model import Model
 from .pair_forces import Met, pair_forces
 from .readouts import ContactForces, Reactions, contact_forces, reactions
@@ -65,13 +65,14 @@ class Readable(Model):
         own = self.loads.forces((positions, state[1]), named["masses"], self.time_step, values)
         return own if forces is None else forces + own
 
-    def poses_at(self, state: State | HistoryState, targets: Targets | None) -> Tensor | None:
-        """Poses of the colliders [B, C, 7] at the end of a step from a checked state; None: they stay."""
+    def collider_inputs(self, state: State | HistoryState, targets: Targets | None) -> ColliderInputs:
+        """What moves colliders in a step from a checked state."""
         if self.body_contact is None:
-            return None
+            return NO_INPUTS
         if isinstance(targets, Mapping):
             self.body_contact.check_transforms(*targets.values())
-        return self.anchors.place_colliders(targets, state[2][0])  # type: ignore[misc]
+        poses: Tensor = state[2][0]  # type: ignore[misc]
+        return ColliderInputs(self.anchors.place_colliders(targets, poses), self.anchors.place_wrenches(targets, poses))
 
     def load_values(self, targets: Targets | None, batch: int) -> dict[str, Tensor]:
         """The arrays `pressure` and `wind` of a step, those that the scene has."""

@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 
 from ..common.checks import STEPS_DIFFER
 from ..plan.material import CORE_ROWS
-from ..scene.targets import Anchors, Targets
+from ..scene.targets import NO_INPUTS, Anchors, ColliderInputs, Targets
 from .state import ContactHistory, HistoryState, HistoryTrack, State, Track, history_of, widened
 from .surface_loads import SurfaceLoads
 
@@ -54,7 +54,7 @@ class Steps(Protocol):
         self, state: State | HistoryState, forces: Tensor | None, targets: Targets | None, material: list[Tensor]
     ) -> Tensor | None: ...
 
-    def poses_at(self, state: State | HistoryState, targets: Targets | None) -> Tensor | None: ...
+    def collider_inputs(self, state: State | HistoryState, targets: Targets | None) -> ColliderInputs: ...
 
     def track(self, *found: Tensor) -> Track | HistoryTrack: ...
 
@@ -68,7 +68,7 @@ class Steps(Protocol):
         every: int,
         inertial: bool,
         report: bool,
-        poses: Tensor | None = None,
+        inputs: ColliderInputs = NO_INPUTS,
     ) -> tuple[Tensor, ...]: ...
 
 
@@ -135,7 +135,7 @@ def _in_chunks(
             every=every,
             inertial=call.inertial,
             report=call.report and recorded,
-            poses=sim.poses_at(state, targets),
+            inputs=sim.collider_inputs(state, targets),
         )
         if recorded:
             chunks.append(chunk)

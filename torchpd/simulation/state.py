@@ -84,6 +84,7 @@ class ContactHistory(NamedTuple):
     poses: Tensor  # [B, C, 7] actual poses of the colliders: x, y, z in m, and a quaternion qw, qx, qy, qz
     keys: Tensor  # [B, M] int64 of pairs with forces, M = `Contact.capacity`; all -1: no forces, as in a new state
     forces: Tensor  # [B, M, 4] N: along the normal, and the vector of friction
+    motion: Tensor  # [B, C, 6] m/s of the centre of mass, rad/s; [B, 0, 6] if no collider has a mass
     flow: Tensor  # [B, P, 10] as in `History`, of no tetrahedra without plastic solids
 
     def __repr__(self) -> str:

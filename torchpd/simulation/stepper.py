@@ -14,7 +14,7 @@ from ..ops.diagonal import elastic_material, named_material
 from ..ops.energy import elastic_energy
 from ..ops.registration import INFO_WIDTH, refuse_forward_mode
 from ..plan.material import check_environments, environments_of_material, named_arrays
-from ..scene.targets import Targets
+from ..scene.targets import NO_INPUTS, ColliderInputs, Targets
 from .readable import Readable
 from .rollout import PerStep, Rollout, run_rollout
 from .state import HistoryState, HistoryTrack, Info, State, StepCall, Track, history_of
@@ -72,7 +72,7 @@ class Stepper(Readable):
         forces: Tensor | None,
         given: Tensor | None,
         material: list[Tensor],
-        poses: Tensor | None,
+        inputs: ColliderInputs,
         *,
         inertial: bool,
         report: bool,
@@ -87,11 +87,11 @@ class Stepper(Readable):
             if contact.plan.grows:
                 contact.check_eager("Simulator")
                 contact = contact.with_capacity(max(contact.plan.capacity, state[2][1].shape[-1]))  # type: ignore[misc]
-            after, rows = contact.step(state, forces, given, poses, material, plan, settings)
+            after, rows = contact.step(state, forces, given, inputs, material, plan, settings)
             while contact.plan.grows and (missing := int(Info.from_rows(rows).contact_overflow.max())):
                 contact = contact.with_capacity(contact.plan.capacity + max(contact.plan.capacity, missing))
                 self._notices.after_growth(self, contact.plan.capacity)
-                after, rows = contact.step(state, forces, given, poses, material, plan, settings)
+                after, rows = contact.step(state, forces, given, inputs, material, plan, settings)
             self.body_contact = contact
             self._notices.after_contact(self, after[0], rows)
         if report and not torch.compiler.is_compiling():
@@ -122,7 +122,8 @@ class Stepper(Readable):
                 pins. A sphere takes its centre [3] or [B, 3], or with its velocity [6] or [B, 6], which friction needs.
                 `Fibres` take their activation during the step, a number [], [B], [n] or [B, n] for n fibres.
                 A `Pressure` takes its overpressure [] or [B] Pa, `Wind` its velocity [3] or [B, 3] m/s. A `Collider`
-                takes its pose [7] or [B, 7], see there; one without a target stays.
+                takes its pose [7] or [B, 7], see there; one without a target stays. With a mass it takes a wrench [6]
+                or [B, 6].
             start: first iterate: "velocity" (x + h v), "inertial" (with gravity and forces), or positions [B, V, 3].
                 The first two are moved along rigid motions and out of contacts. A body that planes would squeeze there
                 starts from x.
@@ -138,8 +139,8 @@ class Stepper(Readable):
         given, inertial = _first_iterate(start, state[0])
         refuse_forward_mode(state[0], state[1], forces, *material)
         self._notices.before(self, state, material, self.time_step, report=return_info)
-        poses = self.poses_at(state, targets)
-        after, rows = self._stepped(state, forces, given, material, poses, inertial=inertial, report=return_info)
+        inputs = self.collider_inputs(state, targets)
+        after, rows = self._stepped(state, forces, given, material, inputs, inertial=inertial, report=return_info)
         return (after, Info.from_rows(rows)) if return_info else after
 
     @torch.no_grad()
@@ -181,7 +182,8 @@ class Stepper(Readable):
             forces = self.forces_at(state, forces, targets, material)
         self._notices.before(self, state, material, self.time_step, report=info is not None)
         if self.body_contact is not None:
-            self._step_in_contact(state, forces, given, material, self.poses_at(state, targets), inertial, info)
+            inputs = self.collider_inputs(state, targets)
+            self._step_in_contact(state, forces, given, material, inputs, inertial, info)
             return
         rows = state[0].new_empty((state[0].shape[0], INFO_WIDTH), dtype=torch.float64) if info is None else info
         _ops.step_(
@@ -211,14 +213,14 @@ class Stepper(Readable):
         forces: Tensor | None,
         given: Tensor | None,
         material: list[Tensor],
-        poses: Tensor | None,
+        inputs: ColliderInputs,
         inertial: bool,
         info: Tensor | None,
     ) -> None:
         """`step_` in a scene with `Contact`."""
         if info is not None:
             check_info(info, (len(state[0]), self.info_width))
-        after, rows = self._stepped(state, forces, given, material, poses, inertial=inertial, report=info is not None)
+        after, rows = self._stepped(state, forces, given, material, inputs, inertial=inertial, report=info is not None)
         old = (state[0], state[1], *state[2])  # type: ignore[misc]
         for kept, new in zip(old, (after[0], after[1], *after[2]), strict=True):
             kept.copy_(new)
@@ -283,11 +285,11 @@ class Stepper(Readable):
         every: int,
         inertial: bool,
         report: bool,
-        poses: Tensor | None = None,
+        inputs: ColliderInputs = NO_INPUTS,
     ) -> tuple[Tensor, ...]:
         """Take steps from a checked state and forces in one call of the op; spheres start where `material` has them.
 
-        Colliders end at `poses` [B, C, 7], or stay.
+        `inputs` move colliders.
 
         Returns:
             Positions and velocities [steps // every, B, V, 3], rows for `Info.from_rows`, and those of the history.
@@ -296,7 +298,7 @@ class Stepper(Readable):
         refuse_forward_mode(state[0], state[1], forces, *material)
         self._notices.before(self, state, material, self.time_step, report=report)
         if self.keeps_history:
-            after, rows = self._stepped(state, forces, None, material, poses, inertial=inertial, report=report)
+            after, rows = self._stepped(state, forces, None, material, inputs, inertial=inertial, report=report)
             taken = tuple(array[None] for array in (after[0], after[1], rows, *after[2]))
             return taken if steps else tuple(array[:0] for array in taken)
         # the adjoint needs every state, so the op has a derivative only with every=1

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..common.checks import to_full_precision
 from ..common.reprs import by_sizes
 from ..common.small_matrices import tree_sum
-from ..scene.contact import Collider, Member
+from ..scene.contact import Collider, Member, can_touch
 from ..scene.part import Body
 from ..scene.scene import Scene
 from .pair_forces import Met, sums_by
@@ -132,5 +132,5 @@ def between(
         (on, by): Wrench(sums[:, a * count + b, :3], sums[:, a * count + b, 3:], about[:, a])
         for on, a in taking
         for by, b in taking
-        if a != b and (isinstance(on, Body) or isinstance(by, Body))
+        if a != b and can_touch(on, by)
     }

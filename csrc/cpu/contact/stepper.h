@@ -58,7 +58,9 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
              contact.history.poses + 7 * e_ * contact.plan.colliders,
              contact.poses + 7 * e_ * contact.plan.colliders,
              contact.history.keys + e_ * contact.plan.capacity,
-             contact.history.forces + 4 * e_ * contact.plan.capacity},
+             contact.history.forces + 4 * e_ * contact.plan.capacity,
+             contact.plan.rigid +
+                 (contact.plan.rigid ? rigid_numbers * e_ * contact.plan.colliders : 0)},
         steps_(env_) {}
 
   void rollout() {

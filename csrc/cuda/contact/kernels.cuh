@@ -124,7 +124,8 @@ PD_DEVICE ContactEnvironment<T> environment_of(const ContactKernel<T>& call,
           w.contact.history.poses + e * plan.colliders * 7,
           w.contact.poses + e * plan.colliders * 7,
           w.contact.history.keys + e * plan.capacity,
-          w.contact.history.forces + 4 * e * plan.capacity};
+          w.contact.history.forces + 4 * e * plan.capacity,
+          plan.rigid + (plan.rigid ? rigid_numbers * e * plan.colliders : 0)};
 }
 
 template <class T>

@@ -86,7 +86,7 @@ class ContactRunner : public StreamRunner<T, HasContacts> {
   }
 
   void align() {
-    if (begun_ && work_.pieces == 0) return;
+    if (begun_ && !moves_rigidly()) return;
     if (work_.pieces > 0) keep_displacements(work_, stream_);
     Base::align();
     run(begun_ ? ContactTask::go_last : ContactTask::go_first);
@@ -110,13 +110,16 @@ class ContactRunner : public StreamRunner<T, HasContacts> {
   }
 
  private:
+  // whether there are bodies or colliders for a coarse correction
+  bool moves_rigidly() const { return work_.pieces > 0 || work_.contact.plan.rigid; }
+
   void run(ContactTask task, int k = 0, int trial = 0) {
     run_contact(task, work_, k, trial, stream_);
   }
 
   // The coarse correction of bodies in contact. Environments that do not ask for a trial return at once.
   void correct(int k) {
-    if (work_.pieces == 0) return;
+    if (!moves_rigidly()) return;
     for (int trial = 0; trial < (HasContacts ? coarse_trials : 1); ++trial) {
       run(ContactTask::begin_correction, k, trial);
       if (HasContacts) {

@@ -51,6 +51,32 @@ PD_HD bool is_positive(const Mat3<double>& a) {
          determinant(a) > 0;
 }
 
+// x with A x = b for an A that is not negative, 0 along rows without pivot: A = L D L^T. `a`: the lower triangle row by row,
+// then b. It is lost.
+PD_HD void solve_twist(double (&a)[27], double (&x)[6]) {
+  const auto at = [](int row, int column) { return row * (row + 1) / 2 + column; };
+  double most = 0, inverse[6];
+  PD_UNROLL
+  for (int i = 0; i < 6; ++i) most = a[at(i, i)] > most ? a[at(i, i)] : most;
+  PD_UNROLL
+  for (int j = 0; j < 6; ++j) {
+    const double pivot = a[at(j, j)];
+    inverse[j] = pivot > no_pivot * most ? 1.0 / pivot : 0.0;
+    PD_UNROLL
+    for (int c = j + 1; c < 6; ++c) {
+      const double factor = inverse[j] * a[at(c, j)];
+      PD_UNROLL
+      for (int r = c; r <= 6; ++r) a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
+    }
+  }
+  PD_UNROLL
+  for (int j = 5; j >= 0; --j) {
+    x[j] = inverse[j] * a[at(6, j)];
+    PD_UNROLL
+    for (int c = 0; c < j; ++c) a[at(6, c)] = subtract_product(a[at(6, c)], a[at(j, c)], x[j]);
+  }
+}
+
 // The passes of one body.
 class CoarseBody {
  public:
@@ -131,7 +157,7 @@ class CoarseBody {
   PD_HD void decide(double (&terms)[terms_count], double lag, double radius) {
     double force[6];
     for (int i = 0; i < 6; ++i) force[i] = terms[at(6, i)];
-    solve(terms);
+    solve_twist(terms, step_);
     slope_ = 0;
     for (int i = 0; i < 6; ++i) slope_ = multiply_add(force[i], step_[i], slope_);
     const double length = length_of(step_), least = still_share * size_;
@@ -238,32 +264,6 @@ class CoarseBody {
     for (int i = 0; i < 3; ++i) {
       line[i] = 0;
       if (body_.hold == Hold::line) line[3 + i] = along * axis[i];
-    }
-  }
-
-  // step = x with A x = b for an A that is not negative, 0 along rows without pivot: A = L D L^T. Terms are lost.
-  PD_HD void solve(double (&a)[terms_count]) {
-    double most = 0, inverse[6];
-    PD_UNROLL
-    for (int i = 0; i < 6; ++i) most = a[at(i, i)] > most ? a[at(i, i)] : most;
-    PD_UNROLL
-    for (int j = 0; j < 6; ++j) {
-      const double pivot = a[at(j, j)];
-      inverse[j] = pivot > no_pivot * most ? 1.0 / pivot : 0.0;
-      PD_UNROLL
-      for (int c = j + 1; c < 6; ++c) {
-        const double factor = inverse[j] * a[at(c, j)];
-        PD_UNROLL
-        for (int r = c; r <= 6; ++r)
-          a[at(r, c)] = subtract_product(a[at(r, c)], factor, a[at(r, j)]);
-      }
-    }
-    PD_UNROLL
-    for (int j = 5; j >= 0; --j) {
-      step_[j] = inverse[j] * a[at(6, j)];
-      PD_UNROLL
-      for (int c = 0; c < j; ++c)
-        a[at(6, c)] = subtract_product(a[at(6, c)], a[at(j, c)], step_[j]);
     }
   }
 

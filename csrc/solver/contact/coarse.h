@@ -9,6 +9,7 @@
 #include "solver/coarse/island.h"
 #include "solver/coarse/thin.h"
 #include "solver/contact/approach.h"
+#include "solver/contact/rigid.h"
 #include "solver/contact/schedule.h"
 
 namespace pd::inline PD_TARGET {
@@ -23,14 +24,14 @@ class ContactCorrection {
   using Env = ContactEnvironment<T>;
 
   PD_HD explicit ContactCorrection(const Env& env)
-      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env) {}
+      : env_(env), plan_(env.plan), a_(env.a), body_(env.body), search_(env), rigid_(env) {}
 
   // Islands of the components that listed pairs join, and of each other one that `touches`: a body that meets itself alone,
   // after the last iteration. `numbers.corrects`: whether there is one.
   template <class Team>
   PD_HD void begin(const Team& team) const {
     ContactNumbers& numbers = env_.numbers();
-    const int pairs = numbers.pairs, count = body_.components;
+    const int pairs = numbers.pairs, count = env_.components();
     team.spread(1, [&](int) { numbers.corrects = numbers.searching = numbers.cuts = 0; });
     team.spread(std::int64_t(count) * count, [&](int n) { a_.couple[n] = 0; });
     team.each(count, [&](int g) {
@@ -50,7 +51,12 @@ class ContactCorrection {
       raise(a_.component_end + g, v + 1);
     });
     if (!numbers.corrects) return;
-    team.groups(count, [&](int g, const auto& group) { sum_body(g, group); });
+    team.groups(body_.components, [&](int g, const auto& group) { sum_body(g, group); });
+    team.each(count - body_.components, [&](int c) {
+      const int g = body_.components + c;
+      a_.coarse_body[g] = CoarseBody(rigid_.body_at(c, a_.hand[c].pose));
+      a_.goes[g] = a_.coarse_body[g].moves();
+    });
     team.each(pairs, [&](int p) {
       a_.joins[p] = joins(a_.pair[p]);
       if (!a_.joins[p]) return;
@@ -122,7 +128,9 @@ class ContactCorrection {
     });
     team.each(plan_.vertices, [&](int v) {
       if (v >= plan_.body_vertices) {
-        a_.target[v] = a_.goal[v];
+        if (moves(v) && a_.coarse_share[a_.root[a_.component[v]]] > 0)
+          a_.place[v] = place_after(v, a_.motion[a_.component[v]]);
+        a_.target[v] = env_.held(v) ? a_.goal[v] : a_.place[v];
         return;
       }
       const int i = a_.inside[v], g = a_.component[v];
@@ -141,6 +149,13 @@ class ContactCorrection {
       }
       a_.target[v] = env_.held(v) ? a_.goal[v] : a_.place[v] + push;
     });
+    team.each(env_.components() - body_.components, [&](int c) {
+      const int g = body_.components + c;
+      Hand<T>& hand = a_.hand[c];
+      if (a_.goes[g] && is_valid(a_.root[g]) && a_.coarse_share[a_.root[g]] > 0)
+        hand.pose = pose_after(c, a_.motion[g]);
+    });
+    if (rigid_.exist()) rigid_.stay(team);
   }
 
   // The last iterate, shifted as this one.
@@ -159,7 +174,7 @@ class ContactCorrection {
 
   // -1: none, or pins leave it no rigid motion
   PD_HD int component_at(int v) const {
-    const int g = v < plan_.body_vertices ? a_.component[v] : -1;
+    const int g = a_.component[v];
     return g >= 0 && a_.goes[g] ? g : -1;
   }
   PD_HD int component_of(int p, int side) const {
@@ -170,8 +185,7 @@ class ContactCorrection {
     return a_.root[a >= 0 ? a : component_of(p, 1)];
   }
   PD_HD bool is_between(const ContactPair<T>& pair) const {
-    const auto component = [&](int v) { return v < plan_.body_vertices ? a_.component[v] : -1; };
-    return component(pair.vertex[0]) != component(pair.vertex[3]);
+    return a_.component[pair.vertex[0]] != a_.component[pair.vertex[3]];
   }
   // a pair of different components that can yield
   PD_HD bool joins(const ContactPair<T>& pair) const {
@@ -192,6 +206,9 @@ class ContactCorrection {
   PD_HD Vec3<double> position(int i) const {
     const CoarseVertex<double> v = coarse_vertex(i);
     return v.x + v.u;
+  }
+  PD_HD Vec3<double> position_of(int v) const {
+    return v < plan_.body_vertices ? position(a_.inside[v]) : wide(a_.place[v]);
   }
 
   // The quadratics of a component.
@@ -230,7 +247,7 @@ class ContactCorrection {
 
   // Members of islands, one after another.
   PD_HD void lay_out() const {
-    const int count = body_.components;
+    const int count = env_.components();
     ContactNumbers& numbers = env_.numbers();
     for (int g = 0; g < count; ++g) {
       a_.root[g] = root_of(a_.root, g);
@@ -267,7 +284,7 @@ class ContactCorrection {
         if (of.on_a(c) != (s == 0)) continue;
         const double share = s == 0 ? double(of.near.weight[c]) : -double(of.near.weight[c]);
         pair.side[s].arm =
-            multiply_add(share, position(a_.inside[of.vertex[c]]) - center, pair.side[s].arm);
+            multiply_add(share, position_of(of.vertex[c]) - center, pair.side[s].arm);
       }
     }
     pair.normal = wide(of.normal);
@@ -284,7 +301,7 @@ class ContactCorrection {
   template <class Team, class Forces>
   PD_HD void find_motions(const Team& team, const Forces& forces) const {
     ContactNumbers& numbers = env_.numbers();
-    const int pairs = numbers.pairs, count = body_.components;
+    const int pairs = numbers.pairs, count = env_.components();
     bool searching = numbers.searching != 0;
     while (searching) {
       team.each(pairs, [&](int p) {
@@ -349,7 +366,7 @@ class ContactCorrection {
   template <class Group>
   PD_HD void sum_couple(int row, int column, const Group& group) const {
     double sums[CoupleSums::count] = {};
-    if (a_.couple[std::int64_t(row) * body_.components + column]) {
+    if (a_.couple[std::int64_t(row) * env_.components() + column]) {
       group.sum_range(
           a_.side_start[row], a_.side_start[row + 1],
           [&](int n, auto& sum) {
@@ -372,7 +389,13 @@ class ContactCorrection {
     return motion;
   }
 
+  PD_HD Pose<T> pose_after(int c, const RigidMotion<double>& motion) const {
+    return moved(a_.hand[c].pose, a_.rigid_collider[c].center, motion.shift, turn_vector(motion));
+  }
+
   PD_HD Vec3<T> place_after(int v, const RigidMotion<double>& motion) const {
+    if (v >= plan_.body_vertices)
+      return pose_after(plan_.collider[v], motion).place(local_point(plan_, v));
     const int i = a_.inside[v];
     const Vec3<T> u = BodyState<T>::read(body_.u, i) + narrow(motion.of(position(i)));
     return body_.place(i, u);
@@ -382,7 +405,7 @@ class ContactCorrection {
   template <class Team>
   PD_HD void find_shares(const Team& team) const {
     ContactNumbers& numbers = env_.numbers();
-    const int count = body_.components, pairs = numbers.pairs;
+    const int count = env_.components(), pairs = numbers.pairs;
     team.spread(1, [&](int) { numbers.leaves = numbers.cuts = numbers.pushes = 0; });
     team.each(count, [&](int g) {
       a_.coarse_share[g] = 1, a_.coarse_group[g] = a_.root[g];
@@ -448,7 +471,7 @@ class ContactCorrection {
   // One share for the islands of a group.
   template <class Team>
   PD_HD void set_limits(const Team& team) const {
-    const int count = body_.components;
+    const int count = env_.components();
     team.spread(1, [&](int) { env_.numbers().changed = 0; });
     team.each(count, [&](int g) { a_.coarse_joint[g] = 1; });
     team.each(count, [&](int g) {
@@ -512,6 +535,7 @@ class ContactCorrection {
   const ContactArrays<T>& a_;
   const BodyState<T>& body_;
   const ContactSearch<T> search_;
+  const RigidColliders<T> rigid_;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -115,6 +115,19 @@ struct ActiveRows {
 // compared with all others.
 enum Limits : int { limits_none, limits_planes, limits_stuck };
 
+// A collider with a mass; see solver/contact/rigid.h. `weight` 0: moves by hand.
+struct RigidCollider {
+  double weight;
+  Vec3<double> center;    // of mass, about its origin
+  Mat3<double> inertia;   // J
+  Vec3<double> momentum;  // L
+  // in an iteration: the centre at the present pose, 1 / size, minus the derivative of E there, and the motion from it
+  Vec3<double> at;
+  double length;
+  Vec3<double> pull, torque, shift, turn;
+  double energy;
+};
+
 // Arrays of an environment. Vertices have the user's numbers, those of colliders last.
 template <class T>
 struct ContactArrays {
@@ -148,9 +161,10 @@ struct ContactArrays {
   Screw<T>* screw;                      // [colliders]
   T *share, *least, *bound;             // [colliders]
   int* barred;                          // [colliders]
+  RigidCollider* rigid_collider;        // [colliders] if one has a mass
   // of the coarse correction
   int *inside,
-      *component;  // [vertices] of bodies: internal number; component that moves rigidly, or -1
+      *component;  // [vertices] internal number, of bodies; component that moves rigidly, or -1
   CoarseBody* coarse_body;               // [components]
   CoarseIsland* island;                  // [components] by its least member
   RigidMotion<double>* motion;           // [components]
@@ -222,7 +236,8 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   arena.place(a.screw, c);
   for (T** array : {&a.share, &a.least, &a.bound}) arena.place(*array, c);
   arena.place(a.barred, c);
-  const std::int64_t g = components;
+  arena.place(a.rigid_collider, plan.rigid ? c : 0);
+  const std::int64_t g = components + (plan.rigid ? c : 0);
   for (int** array : {&a.inside, &a.component}) arena.place(*array, v);
   arena.place(a.coarse_body, g);
   arena.place(a.island, g);
@@ -327,8 +342,11 @@ struct ContactEnvironment {
   const T *poses, *goal_poses;      // [colliders, 7] at the start, and of the step's end
   const std::int64_t* history_key;  // [capacity]
   const T* history_force;           // [capacity, 4]
+  const T* rigid;                   // [colliders, 13] as in ContactPlan
 
   PD_HD bool held(int v) const { return a.held[v] != 0; }
+  // components that move rigidly: those of bodies, then colliders if one has a mass
+  PD_HD int components() const { return body.components + (plan.rigid ? plan.colliders : 0); }
   PD_HD int owners() const { return plan.points + plan.edges; }
   PD_HD ContactNumbers& numbers() const { return *a.numbers; }
 

@@ -67,7 +67,11 @@ class FreeMotion {
     return plan_.surface_start[body] < plan_.surface_start[body + 1];
   }
   PD_HD bool moves_by_hand(int body) const {
-    return !has_surface(body) || plan_.body_start[body] >= plan_.body_vertices;
+    const int first = plan_.body_start[body];
+    if (!has_surface(body)) return true;
+    return first >= plan_.body_vertices &&
+           !(plan_.rigid &&
+             plan_.rigid[rigid_numbers * std::int64_t(plan_.collider[first])] > T(0));
   }
 
   PD_HD T margin() const { return T(0.5 + slack_share) * plan_.thickness; }

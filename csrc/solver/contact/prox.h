@@ -4,7 +4,7 @@
 // one, the CPU as many as a vector register holds. Forces are added to vertices in the order of the pairs: by pairs where
 // a team takes items in order, else by vertices, over their entries.
 #pragma once
-#include "solver/contact/environment.h"
+#include "solver/contact/rigid.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -15,7 +15,7 @@ class ContactProx {
   using Row = ActiveRow<T>;
 
   PD_HD explicit ContactProx(const Env& env)
-      : env_(env), a_(env.a), rows_{env.a.first_rows, env.a.rows} {}
+      : env_(env), a_(env.a), rows_{env.a.first_rows, env.a.rows}, rigid_(env) {}
 
   // Closest points at the present iterate, and the pairs that are active. c = theta omega
   template <class Team>
@@ -32,7 +32,9 @@ class ContactProx {
     const int active = numbers.active, moved = numbers.moved;
     if (active == 0) return;
     push(team, active, moved, true);
+    if (rigid_.exist()) rigid_.begin(team, active);
     for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
+      if (rigid_.exist()) rigid_.move(team, active, moved);
       team.template blocks<T>(
           active, [&](const auto& lanes) { advance(lanes, numbers.changes[sweep], sweep == 0); });
       // a further sweep would change nothing either
@@ -177,6 +179,7 @@ class ContactProx {
   const Env& env_;
   const ContactArrays<T>& a_;
   const ActiveRows<T> rows_;
+  const RigidColliders<T> rigid_;
 };
 
 }  // namespace pd::inline PD_TARGET

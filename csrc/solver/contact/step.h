@@ -20,7 +20,8 @@ class ContactSteps {
         body_(env.body),
         search_(env),
         correction_(env),
-        prox_(env) {}
+        prox_(env),
+        rigid_(env) {}
 
   // A step begins at the places of bodies; poses are those of colliders, actual ones and those of the step's end.
   template <class Team>
@@ -47,7 +48,9 @@ class ContactSteps {
       a_.goal[v] = goal.place(local_point(plan_, v));
       a_.inverse[v] = T(0);
       a_.held[v] = 1;
+      a_.component[v] = -1;
     });
+    if (rigid_.exist()) rigid_.start(team);
     team.spread(plan_.points, [&](int n) { a_.surface[plan_.point[n]] = 1; });
     team.once([&] {
       ContactNumbers numbers = {};
@@ -85,7 +88,7 @@ class ContactSteps {
         touch(b);
       });
     });
-    want(team, body_.u);
+    want(team, body_.u, true);
     team.barrier();
     approach.move(team);
     search_.find(team, true);
@@ -93,6 +96,10 @@ class ContactSteps {
     team.each(plan_.vertices, [&](int v) {
       a_.cut[v] = 0;
       if (!env_.held(v) && approach.was_stopped(plan_.body[v])) a_.target[v] = a_.place[v];
+    });
+    team.spread(rigid_.exist() ? plan_.colliders : 0, [&](int c) {
+      Hand<T>& hand = a_.hand[c];
+      if (rigid_.is_rigid(c) && approach.was_stopped(plan_.body[hand.begin])) hand.goal = hand.pose;
     });
     double none[2];
     go(team, false, none);
@@ -112,7 +119,8 @@ class ContactSteps {
         touch(a_.pair[p].vertex[3]);
       });
     });
-    want(team, body_.u);
+    want(team, body_.u, false);
+    if (rigid_.exist()) rigid_.stay(team);
     team.barrier();
     watch(team, pairs, false);
     prepare(team, iterations);
@@ -124,7 +132,7 @@ class ContactSteps {
   // at the gradient by the targets of now. Returns whether there is something to correct.
   template <class Team>
   PD_HD bool begin_correction(const Team& team) const {
-    if (body_.components == 0) return false;
+    if (env_.components() == 0) return false;
     look(team, env_.numbers().pairs);
     correction_.begin(team);
     if (!env_.numbers().corrects) return false;
@@ -185,12 +193,15 @@ class ContactSteps {
         a_.target[plan_.body_vertices + n] = a_.goal[plan_.body_vertices + n];
         watch_vertex(plan_.body_vertices + n);
       });
+      if (rigid_.exist()) rigid_.aim(team);
     } else {
-      want(team, body_.free);
+      want(team, body_.free, false);
       team.barrier();
       prox_.take(team, pairs, of.c);
-      if (of.guards) merits = check(team, pairs, of.energy);
+      if (of.guards)
+        merits = check(team, pairs, rigid_.exist() ? of.energy + rigid_.energy(team) : of.energy);
       prox_.run(team);
+      if (rigid_.exist()) rigid_.aim(team);
       watch(team, pairs, true);
     }
     prepare(team, k);
@@ -220,9 +231,11 @@ class ContactSteps {
       const Vec3<T> force = env_.force_on(v);
       T* const to = forces + 3 * std::int64_t(v);
       to[0] = force.x, to[1] = force.y, to[2] = force.z;
-      if (!env_.held(v)) return;
-      const Vec3<T> left = a_.place[v] - a_.goal[v];
+      if (!env_.held(v) && v < plan_.body_vertices) return;
       const int number = v < plan_.body_vertices ? plan_.colliders : plan_.collider[v];
+      const Vec3<T> goal =
+          env_.held(v) ? a_.goal[v] : a_.hand[number].goal.place(local_point(plan_, v));
+      const Vec3<T> left = a_.place[v] - goal;
       raise(a_.most + number, square_root(dot(left, left)));
     });
   }
@@ -291,13 +304,15 @@ class ContactSteps {
     BodyState<T>::write(body_.free, i, u);
     a_.target[v] = env_.held(v) ? a_.goal[v] : body_.place(i, u);
   }
+  // `aims`: colliders with a mass to the ends of their free motions
   template <class Team>
-  PD_HD void want(const Team& team, const T* displacement) const {
+  PD_HD void want(const Team& team, const T* displacement, bool aims) const {
     team.spread(1, [&](int) { env_.numbers().cut = 0; });
     team.spread(plan_.vertices, [&](int v) { a_.limits[v] = limits_none; });
     team.spread(body_.vertices, [&](int i) { want_vertex(i, displacement); });
     team.spread(plan_.vertices - plan_.body_vertices, [&](int n) {
-      a_.target[plan_.body_vertices + n] = a_.goal[plan_.body_vertices + n];
+      const int v = plan_.body_vertices + n;
+      a_.target[v] = aims || env_.held(v) ? a_.goal[v] : a_.place[v];
     });
   }
 
@@ -520,6 +535,7 @@ class ContactSteps {
   const ContactSearch<T> search_;
   const ContactCorrection<T> correction_;
   const ContactProx<T> prox_;
+  const RigidColliders<T> rigid_;
 };
 
 }  // namespace pd::inline PD_TARGET

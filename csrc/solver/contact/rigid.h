@@ -1,0 +1,312 @@
+// Colliders with a mass: rigid bodies that move by inertia, weight, an applied wrench and the forces of pairs.
+//
+// With the centre of mass c, the turn u since the start of the step (Cayley's vector, along the axis by 2 tan(angle / 2)),
+// W = m / h^2, the angular momentum h L of the free motion and its moment of inertia h^2 J (at the middle of the turn), the
+// objective of a step has
+//   E(c, u) = W / 2 |c - c_goal|^2 + u . J u / 2 - L . u.
+// Its minimum is the free motion. At the present pose, a small shift t and turn w change it by
+//   W / 2 |t|^2 + w . J w / 2 - W (c_goal - c) . t - torque . w,   torque = (1 + [u] / 2 + u u^T / 4) (L - J u).
+// What balances the torque takes that momentum: L_next = L - torque.
+// The prox of an iteration (solver/contact/prox.h) has t and w as six more unknowns, in this metric. So no momentum acts on
+// a collider: it is where its inertia and the forces of its pairs leave it. Each sweep solves for t and w first, with forces
+// of pairs that follow them by beta. Pairs then take the motion of their corners for given.
+#pragma once
+#include "solver/contact/environment.h"
+
+namespace pd::inline PD_TARGET {
+
+// Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
+constexpr double rigid_yield = 1e-3;
+constexpr double half_turn = 1e-9;  // least cosine of half of a turn
+
+PD_HD Pose<double> widened(const Pose<float>& a) {
+  return {widened<double>(a.origin), double(a.w), widened<double>(a.axis)};
+}
+PD_HD Pose<double> widened(const Pose<double>& a) { return a; }
+
+// The pose after a shift of the `center`, a point of the body, and Cayley's turn about it.
+template <class T>
+PD_HD Pose<T> moved(const Pose<T>& from, const Vec3<double>& center, const Vec3<double>& shift,
+                    const Vec3<double>& turn) {
+  const Pose<double> old = widened(from);
+  const Quaternion<double> q =
+      Quaternion<double>{1.0, 0.5 * turn} * Quaternion<double>{old.w, old.axis};
+  const double scale = 1.0 / square_root(multiply_add(q.w, q.w, dot(q.axis, q.axis)));
+  const Pose<double> about{{0, 0, 0}, scale * q.w, scale * q.axis};
+  const Vec3<double> origin = (old.place(center) + shift) - about.place(center);
+  return {{T(origin.x), T(origin.y), T(origin.z)},
+          T(about.w),
+          {T(about.axis.x), T(about.axis.y), T(about.axis.z)}};
+}
+
+template <class T>
+class RigidColliders {
+ public:
+  using Env = ContactEnvironment<T>;
+  using Row = ActiveRow<T>;
+
+  PD_HD explicit RigidColliders(const Env& env)
+      : env_(env), plan_(env.plan), a_(env.a), rows_{env.a.first_rows, env.a.rows} {}
+
+  PD_HD bool exist() const { return plan_.rigid != nullptr; }
+  PD_HD bool is_rigid(int c) const { return exist() && a_.rigid_collider[c].weight > 0; }
+
+  // At the start of a step: their vertices do not move by hand.
+  template <class Team>
+  PD_HD void start(const Team& team) const {
+    team.each(plan_.colliders, [&](int c) {
+      const T* const n = env_.rigid + rigid_numbers * std::int64_t(c);
+      const auto vector = [&](int at) {
+        return Vec3<double>{double(n[at]), double(n[at + 1]), double(n[at + 2])};
+      };
+      RigidCollider& of = a_.rigid_collider[c];
+      of.weight = n[0];
+      of.center = vector(1);
+      const Vec3<double> first = vector(4), last = vector(7);
+      of.inertia = {{first, {first.y, last.x, last.y}, {first.z, last.y, last.z}}};
+      of.momentum = vector(10);
+    });
+    each_vertex(team, [&](int v, int c) {
+      a_.held[v] = 0;
+      a_.inverse[v] = T(rigid_yield / a_.rigid_collider[c].weight);
+      a_.component[v] = env_.body.components + c;
+    });
+  }
+
+  PD_HD Pose<T> free_goal(int c) const { return Hand<T>::read(env_.goal_poses + 7 * c); }
+
+  // Cayley's vector of the turn from the start of the step to a pose.
+  PD_HD Vec3<double> turn_to(int c, const Pose<double>& pose) const {
+    const Pose<double> begin = widened(Hand<T>::read(env_.poses + 7 * c));
+    const Quaternion<double> q =
+        Quaternion<double>{pose.w, pose.axis} * Quaternion<double>{begin.w, -begin.axis};
+    const double w = absolute(q.w), sign = q.w < 0 ? -2.0 : 2.0;
+    return (sign / (w > half_turn ? w : half_turn)) * q.axis;
+  }
+
+  // The quadratics of a collider at a pose, as those of a body's vertices with these derivatives.
+  PD_HD RigidBody body_at(int c, const Pose<T>& pose) const {
+    const RigidCollider& of = a_.rigid_collider[c];
+    const Pose<double> at = widened(pose);
+    const Vec3<double> turn = turn_to(c, at), left = of.momentum - of.inertia * turn,
+                       torque = multiply_add(0.25 * dot(turn, left), turn,
+                                             multiply_add(0.5, cross(turn, left), left));
+    const double half = 0.5 * trace(of.inertia);
+    const Mat3<double> whole{{{half, 0, 0}, {0, half, 0}, {0, 0, half}}},
+        twist = cross_matrix(0.5 * torque);
+    RigidBody body;
+    body.weight = of.weight;
+    body.center = at.place(of.center);
+    body.pull = of.weight * (widened(free_goal(c)).place(of.center) - body.center);
+    body.second_moment = whole - of.inertia;
+    for (int r = 0; r < 3; ++r) body.covariance.row[r] = body.second_moment.row[r] + twist.row[r];
+    body.square = of.weight > 0 ? half / of.weight : 0.0;
+    return body;
+  }
+
+  // E of all colliders at their poses.
+  template <class Team>
+  PD_HD double energy(const Team& team) const {
+    team.each(plan_.colliders, [&](int c) {
+      if (!is_rigid(c)) return;
+      RigidCollider& of = a_.rigid_collider[c];
+      const Pose<double> pose = widened(a_.hand[c].pose);
+      const Vec3<double> way = pose.place(of.center) - widened(free_goal(c)).place(of.center),
+                         turn = turn_to(c, pose);
+      of.energy =
+          0.5 * (of.weight * dot(way, way) + dot(turn, of.inertia * turn)) - dot(of.momentum, turn);
+    });
+    double sum = 0;
+    for (int c = 0; c < plan_.colliders; ++c)
+      if (is_rigid(c)) sum += a_.rigid_collider[c].energy;
+    return sum;
+  }
+
+  // Before the sweeps of an iteration: the pairs of each collider, and its metric.
+  template <class Team>
+  PD_HD void begin(const Team& team, int active) const {
+    const int pairs = env_.numbers().pairs;
+    team.spread(pairs, [&](int p) { a_.joins[p] = 0; });
+    team.each(plan_.colliders, [&](int c) {
+      a_.side_start[c] = 0;
+      if (!is_rigid(c)) return;
+      RigidCollider& of = a_.rigid_collider[c];
+      const RigidBody body = body_at(c, a_.hand[c].pose);
+      of.at = body.center;
+      of.length = body.square > 0 ? 1.0 / square_root(body.square) : 1.0;
+      of.pull = body.pull;
+      of.torque = axis_of(body.covariance);
+      of.shift = of.turn = {0, 0, 0};
+    });
+    team.each(active, [&](int q) {
+      const Row row = rows_[q];
+      T sum(0);
+      for (int corner = 0; corner < 4; ++corner)
+        sum = multiply_add(absolute(row[Row::moves + corner]), a_.weight[row.vertex(corner)], sum);
+      row[Row::beta] = T(1) / sum;
+      const int p = row.pair();
+      for (int s = 0; s < 2; ++s) {
+        const int c = side(a_.pair[p], s);
+        a_.terms[p].arm[s] = {0, 0, 0};
+        if (c < 0) continue;
+        a_.terms[p].arm[s] = point(a_.pair[p], s) - a_.rigid_collider[c].at;
+        a_.joins[p] = 1;
+        count_one(a_.side_start + c);
+      }
+    });
+    team.scan(a_.side_start, plan_.colliders);
+    team.groups(plan_.colliders, [&](int c, const auto& group) {
+      if (a_.side_start[c] == a_.side_start[c + 1]) return;
+      group.select(
+          pairs,
+          [&](int p) {
+            return a_.joins[p] && (side(a_.pair[p], 0) == c || side(a_.pair[p], 1) == c);
+          },
+          a_.side_pair + a_.side_start[c]);
+    });
+    team.barrier();
+  }
+
+  // Newton's step of all colliders by the forces that follow them. Then their corners move with them.
+  template <class Team>
+  PD_HD void move(const Team& team, int active, int moved) const {
+    carry(team, moved);
+    team.each(active, [&](int q) {
+      if (a_.joins[rows_[q].pair()]) find_terms(rows_[q]);
+    });
+    team.groups(plan_.colliders, [&](int c, const auto& group) {
+      if (a_.side_start[c] == a_.side_start[c + 1]) return;
+      double sums[ContactSums::count] = {};
+      group.sum_range(
+          a_.side_start[c], a_.side_start[c + 1],
+          [&](int n, auto& sum) {
+            const int p = a_.side_pair[n];
+            add_terms(sum, a_.terms[p].of_side(side(a_.pair[p], 0) == c ? 0 : 1, false));
+          },
+          sums);
+      if (group.leads()) step(a_.rigid_collider[c], sums);
+    });
+    team.barrier();
+    carry(team, moved);
+  }
+
+  // After the sweeps: goals and targets, of colliders without a force the free motion.
+  template <class Team>
+  PD_HD void aim(const Team& team) const {
+    const bool some = env_.numbers().active > 0;
+    team.each(plan_.colliders, [&](int c) {
+      if (!is_rigid(c)) return;
+      const RigidCollider& of = a_.rigid_collider[c];
+      const bool meets = some && a_.side_start[c] < a_.side_start[c + 1];
+      a_.hand[c].goal =
+          meets ? pd::moved(a_.hand[c].pose, of.center, of.shift, of.turn) : free_goal(c);
+    });
+    each_vertex(team,
+                [&](int v, int c) { a_.target[v] = a_.hand[c].goal.place(local_point(plan_, v)); });
+  }
+
+  // Colliders stay where they are.
+  template <class Team>
+  PD_HD void stay(const Team& team) const {
+    team.each(plan_.colliders, [&](int c) {
+      if (is_rigid(c)) a_.hand[c].goal = a_.hand[c].pose;
+    });
+  }
+
+ private:
+  template <class Team, class Visit>
+  PD_HD void each_vertex(const Team& team, const Visit& visit) const {
+    team.each(plan_.vertices - plan_.body_vertices, [&](int n) {
+      const int v = plan_.body_vertices + n, c = plan_.collider[v];
+      if (is_rigid(c)) visit(v, c);
+    });
+  }
+
+  // -1: no collider with a mass
+  PD_HD int side(const ContactPair<T>& pair, int s) const {
+    const int c = plan_.collider[pair.vertex[s == 0 ? 0 : 3]];
+    return c >= 0 && is_rigid(c) ? c : -1;
+  }
+
+  // The closest point of a side.
+  PD_HD Vec3<double> point(const ContactPair<T>& pair, int s) const {
+    Vec3<double> sum = {0, 0, 0};
+    for (int a = 0; a < 4; ++a) {
+      if (pair.on_a(a) != (s == 0)) continue;
+      const double share = s == 0 ? double(pair.near.weight[a]) : -double(pair.near.weight[a]);
+      sum = multiply_add(share, widened<double>(a_.place[pair.vertex[a]]), sum);
+    }
+    return sum;
+  }
+
+  // Corners of active pairs move with their colliders.
+  template <class Team>
+  PD_HD void carry(const Team& team, int moved) const {
+    team.each(moved, [&](int n) {
+      const int v = a_.moved[n], c = plan_.collider[v];
+      if (c < 0 || !is_rigid(c)) return;
+      const RigidCollider& of = a_.rigid_collider[c];
+      const Vec3<double> by = of.shift + cross(of.turn, widened<double>(a_.place[v]) - of.at);
+      a_.moved_by[v] = {T(by.x), T(by.y), T(by.z), T(0)};
+    });
+  }
+
+  // The force that a pair would have after a sweep, and how it follows its corners.
+  PD_HD void find_terms(const Row& row) const {
+    const auto vector = [&](int n) { return Vec3<T>{row[n], row[n + 1], row[n + 2]}; };
+    Vec3<T> between = vector(Row::between);
+    for (int corner = 0; corner < 4; ++corner) {
+      const Four<T> by = a_.moved_by[row.vertex(corner)];
+      between = multiply_add(row[Row::weight + corner], Vec3<T>{by.x, by.y, by.z}, between);
+    }
+    const T beta = row[Row::beta], friction = row[Row::friction];
+    const Vec3<T> normal = vector(Row::normal), before = vector(Row::before);
+    const Multiplier<T> old{row[Row::normal_force], vector(Row::tangential)},
+        next = pd::advance(old, beta, row[Row::thickness], friction, normal, between, before);
+    const Vec3<T> pull = tangential(
+        subtract_product(old.tangential, beta, tangential(between - before, normal)), normal);
+    const T size = square_root(dot(pull, pull)), bound = friction * next.normal;
+    const int p = row.pair();
+    // steps of two colliders at once, each with half of the pair
+    const double both = side(a_.pair[p], 0) >= 0 && side(a_.pair[p], 1) >= 0 ? 2.0 : 1.0;
+    PairTerms& terms = a_.terms[p];
+    terms.before = terms.after = terms.lag = terms.radius = 0;
+    terms.normal = widened<double>(normal);
+    terms.force = widened<double>(multiply_add(next.normal, normal, next.tangential));
+    terms.along = both * double(beta);
+    terms.across = bound > T(0) ? terms.along * (size > bound ? double(bound / size) : 1.0) : 0.0;
+  }
+
+  // One step toward the balance of inertia and forces.
+  PD_HD void step(RigidCollider& of, const double (&sum)[ContactSums::count]) const {
+    using S = ContactSums;
+    const Vec3<double> force = subtract_product(of.pull, of.weight, of.shift),
+                       torque = of.torque - of.inertia * of.turn;
+    const double own[6] = {force.x, force.y, force.z, torque.x, torque.y, torque.z};
+    const Mat3<double>& j = of.inertia;
+    const double turns[6] = {j.row[0].x, j.row[1].x, j.row[1].y,
+                             j.row[2].x, j.row[2].y, j.row[2].z};
+    double terms[27], way[6];
+    for (int r = 0; r <= 6; ++r) {
+      for (int c = 0; c <= r && c < 6; ++c) {
+        const double scale = (r < 3 || r == 6 ? 1.0 : of.length) * (c < 3 ? 1.0 : of.length);
+        const double inertia = r == 6  ? own[c]
+                               : r < 3 ? (r == c ? of.weight : 0.0)
+                               : c < 3 ? 0.0
+                                       : turns[(r - 3) * (r - 2) / 2 + c - 3];
+        terms[r * (r + 1) / 2 + c] =
+            scale * (inertia + (r == 6 ? sum[S::force + c] : sum[S::at(r, c)]));
+      }
+    }
+    solve_twist(terms, way);
+    of.shift = of.shift + Vec3<double>{way[0], way[1], way[2]};
+    of.turn = multiply_add(of.length, Vec3<double>{way[3], way[4], way[5]}, of.turn);
+  }
+
+  const Env& env_;
+  const ContactPlan<T>& plan_;
+  const ContactArrays<T>& a_;
+  const ActiveRows<T> rows_;
+};
+
+}  // namespace pd::inline PD_TARGET
