@@ -148,4 +148,5 @@ def _turn_between(start: Tensor, end: Tensor) -> Tensor:
     own, of = end[..., :1], end[..., 1:]
     along = own * w - dot(of, axis)[..., None]
     across = own * axis + w * of + torch.linalg.cross(of, axis)
-    return torch.where(along < 0.0, -2.0, 2.0).to(start.dtype) * across / along.abs().clamp(min=_HALF_TURN)
+    turn: Tensor = torch.where(along < 0.0, -2.0, 2.0).to(start.dtype) * across / along.abs().clamp(min=_HALF_TURN)
+    return turn
