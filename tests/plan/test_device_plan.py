@@ -73,7 +73,7 @@ def test_kernels_differ_in_rest_shapes_and_in_how_patches_exchange_alone(case: t
 
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_rest_shapes_are_there_once(kernel: int, case: tuple[str, int]) -> None:
-    """Positions for the stream, whole numbers in float32; matrices for others and single patches. Others are rounded."""
+    """Positions for the stream, whole numbers in float32; matrices for others and single patches. All else rounded."""
     double, single = arrays_of(case, kernel), arrays_of(case, kernel, torch.float32)
     blocks, slots, patches = len(double.pair_tet), len(double.slot_vertex), len(double.patch_pairs)
     computed = kernel == STREAM
