@@ -35,6 +35,21 @@ def test_a_cube_follows_its_table() -> None:
     assert float(found) == pytest.approx(1.0, abs=1e-6)
 
 
+def test_a_cube_rests_at_the_thickness() -> None:
+    """d (height of the top) / d thickness = 1, once it rests: to 1e-6 after 20 steps."""
+    course = slope(0.0, 0.0)
+    sim = simulator(course.scene, 128)
+    thickness = torch.tensor(1.2e-3, dtype=torch.float64, requires_grad=True)
+    sim.contact_thickness = thickness
+    assert sim.contact_thickness.tolist() == [1.2e-3]
+    state: Any = sim.rest_state()
+    for _ in range(20):
+        state = sim(state)
+    (found,) = torch.autograd.grad(state.positions[0, :, 1].max(), thickness)
+    assert float(found) == pytest.approx(1.0, abs=1e-6)
+    assert float(state.positions.detach()[0, :, 1].min()) == pytest.approx(1.2e-3, abs=1e-6)
+
+
 def test_a_sliding_block() -> None:
     """d x / d friction = -h^2 g k (k + 1) / 2 after k steps: to 1e-3, once it has stopped shaking."""
     course = slope(0.0, 0.4, speed=2.0)

@@ -58,6 +58,10 @@ STEPS: dict[str, Callable[[], object]] = {
     r"contact_friction must be the same for \(a, b\) and \(b, a\)": lambda: setattr(
         SIM, "contact_friction", torch.arange(9.0).reshape(3, 3)
     ),
+    r"contact_thickness must be one number for all surfaces, got a tensor \[2\]": lambda: setattr(
+        SIM, "contact_thickness", torch.ones(2)
+    ),
+    "contact_thickness must be positive .*got -1": lambda: setattr(SIM, "contact_thickness", -1.0),
     "Contact must not be transformed by torch.func or vmap, got mapped .*rest_state": lambda: torch.func.vmap(SIM)(
         mapped(STATE)
     ),

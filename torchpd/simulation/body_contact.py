@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..common.checks import check_scalar
 from ..ops.diagonal import named_material
-from ..ops.fake_kernels import CONTACT_FRICTION, CONTACT_RIGID
+from ..ops.fake_kernels import CONTACT_FRICTION, CONTACT_RIGID, CONTACT_THICKNESS
 from ..plan.contact_clusters import contact_clusters
 from ..plan.contact_plan import ContactPlan, contact_plan
 from ..plan.contact_start import check_start
@@ -75,6 +76,31 @@ class BodyContact:
         arrays = list(self.arrays)
         arrays[CONTACT_FRICTION] = table
         return replace(self, plan=replace(self.plan, friction=values.copy()), arrays=arrays)
+
+    @property
+    def thickness(self) -> Tensor:
+        """Distance at which surfaces meet [m], [1] on the CPU."""
+        return self.arrays[CONTACT_THICKNESS]
+
+    def with_thickness(self, thickness: Tensor | float, values: SceneValues) -> BodyContact:
+        """The same with another thickness, [] or [1], through which gradients flow. `values`: those of the scene."""
+        given = torch.as_tensor(thickness)
+        if given.numel() != 1:
+            raise ValueError(
+                f"contact_thickness must be one number for all surfaces, got a tensor {list(given.shape)}; set a float "
+                "or a tensor []"
+            )
+        number = check_scalar("contact_thickness", float(given.detach()))
+        if number <= 0.0:
+            raise ValueError(f"contact_thickness must be positive [m], got {number}")
+        assert values.contact is not None
+        own = replace(values.contact, thickness=number, capacity=self.plan.capacity)
+        plan = replace(contact_plan(replace(values, contact=own)), friction=self.plan.friction)
+        made = BodyContact._made(plan, self.friction.dtype, self.friction.device)
+        arrays = list(made.arrays)
+        arrays[CONTACT_FRICTION] = self.friction
+        arrays[CONTACT_THICKNESS] = given.reshape(1).to(arrays[CONTACT_THICKNESS])
+        return replace(made, arrays=arrays)
 
     @staticmethod
     def _made(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> BodyContact:
