@@ -45,6 +45,7 @@ enum ContactSize : int {
   size_capacity,
   size_point_clusters,
   size_edge_clusters,
+  size_can_be_free,
   contact_size_count
 };
 
@@ -61,6 +62,7 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
   plan.capacity = sizes[size_capacity];
   plan.point_clusters = sizes[size_point_clusters];
   plan.edge_clusters = sizes[size_edge_clusters];
+  plan.can_be_free = sizes[size_can_be_free] != 0;
   const auto array = [&](ContactArray which, at::ScalarType type, std::int64_t rows,
                          std::int64_t width, const char* meaning) -> const void* {
     check_array(arrays[which], type, rows, width, place, "contact", meaning);

@@ -30,6 +30,7 @@ struct ContactPlan {
       colliders = 0, capacity = 0, clusters = 0, point_clusters = 0, edge_clusters = 0;
   std::int64_t rest_pairs = 0;
   T thickness = 0;
+  bool can_be_free = false;  // whether all bodies that may meet themselves have `rest_apart`
 };
 
 // What a step leaves for the next one, of every environment.

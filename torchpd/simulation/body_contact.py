@@ -243,7 +243,9 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     clusters = contact_clusters(trees, [plan.vertices[:, None], plan.edges, plan.triangles], plan.body)
     # vertices, and those of surfaces, lie body by body
     starts = [np.searchsorted(of, np.arange(bodies + 1)) for of in (plan.body, plan.body[plan.vertices])]
-    sizes = whole([bodies, len(plan.poses), plan.capacity, *clusters.counts])
+    parts = np.bincount(plan.body[plan.vertices], minlength=bodies)
+    can_be_free = bool(((plan.apart > 0.0) | ~plan.self_contact | (parts == 0)).all())
+    sizes = whole([bodies, len(plan.poses), plan.capacity, *clusters.counts, can_be_free])
     surfaces = [plan.triangles, plan.edges, plan.vertices, plan.body, plan.collider, plan.self_contact]
     search = [clusters.leaves.reshape(-1, FAN_OUT), clusters.body, np.stack(starts)]
     rest = [plan.near.thickness, plan.shape, plan.apart]

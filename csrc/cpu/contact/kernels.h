@@ -54,6 +54,7 @@ std::vector<std::int64_t> step_free(const StepCall<T>& call, const ContactCall<T
                                     int threads) {
   std::vector<std::int64_t> list(call.batch), left;
   for (std::int64_t e = 0; e < call.batch; ++e) list[e] = e;
+  if (!contact.plan.can_be_free) return list;
   std::vector<char> is_free(call.batch);
   const auto make = [&] { return FreeLook<T>(call, contact); };
   each_environment(list, threads, make, [&](FreeLook<T>& look, std::int64_t e, const Team&) {

@@ -196,7 +196,8 @@ struct ContactStep {
     const std::size_t shared =
         fused_shared_bytes(sizeof(T), false, plan.most_slots, plan.most_entries,
                            material.planes_count, material.spheres_count);
-    tries_free = plan.patches == 1 && shared <= shared_memory_per_block();
+    tries_free =
+        given.contact.plan.can_be_free && plan.patches == 1 && shared <= shared_memory_per_block();
     free.plan.kernel = int(DeviceKernel::block);
     Arena arena(memory);
     if (tries_free) {

@@ -105,7 +105,7 @@ class ContactSteps {
     go(team, false, none);
     team.each(body_.vertices,
               [&](int i) { BodyState<T>::write(body_.before, i, BodyState<T>::read(body_.u, i)); });
-    team.each(body_.components, [&](int g) { a_.touches[g] = 0; });
+    team.each(env_.components(), [&](int g) { a_.touches[g] = 0; });
   }
 
   // At the end bodies that touch nothing are corrected again. `touches` has those that the last correction takes.
