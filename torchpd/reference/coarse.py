@@ -30,7 +30,7 @@ from .geometry import twists
 if TYPE_CHECKING:
     from .objective import Objective
 
-__all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "islands"]
+__all__ = ["Correction", "Motions", "MotionsOf", "RigidMotions", "correct", "curvature", "finite", "islands"]
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -171,7 +171,7 @@ class RigidMotions(Motions):
         flat = self.modes.reshape(-1, self.modes.shape[2])
         hessian = flat.T @ (np.repeat(self.problem.weight[self.vertices], 3)[:, None] * flat)
         for _, arms, basis, rows, columns in self.parts:
-            exact = hessian[columns, columns] + basis.T @ _curvature(self.pull[rows], arms) @ basis
+            exact = hessian[columns, columns] + basis.T @ curvature(self.pull[rows], arms) @ basis
             if basis.shape[1] and np.linalg.eigvalsh(exact)[0] > 0.0:
                 hessian[columns, columns] = exact
         return np.asarray(hessian)
@@ -197,7 +197,7 @@ class RigidMotions(Motions):
         """The same after finite motions along the twists [N]; hard pins stay."""
         displacement = self.displacement.copy()
         for own, arms, basis, _, columns in self.parts:
-            displacement[own] += _finite(basis @ motion[columns], arms)
+            displacement[own] += finite(basis @ motion[columns], arms)
         return replace(self, displacement=displacement)
 
     def way(self, motion: Array) -> Array:
@@ -380,7 +380,7 @@ def _cross(vectors: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _curvature(left: Array, arms: Array) -> Array:
+def curvature(left: Array, arms: Array) -> Array:
     """Second derivative [6, 6] of -sum left . (finite motion - its first order) by the twist; left = a (s - u)."""
     moment = left.T @ arms
     curvature = np.zeros((6, 6))
@@ -388,7 +388,7 @@ def _curvature(left: Array, arms: Array) -> Array:
     return curvature
 
 
-def _finite(twist: Array, arms: Array) -> Array:
+def finite(twist: Array, arms: Array) -> Array:
     """Displacement of arms [n, 3] by a twist (v, w): (R - 1) r + v, R the turn about w by 2 atan(|w| / 2) (Cayley)."""
     half = _cross(0.5 * twist[3:])
     turn = 2.0 / (1.0 + 0.25 * float(twist[3:] @ twist[3:])) * (half + half @ half)

@@ -146,12 +146,10 @@ PD_HD bool complete(const ContactPlan<T>& plan, const Held& held, ContactPair<T>
   if (first == last && !plan.touches_itself[first]) return false;
   if (held(v[0]) && held(v[1]) && held(v[2]) && held(v[3])) return false;
   pair.thickness = plan.thickness;
-  if (first == last) {
-    const std::int64_t at = find_sorted(plan.rest_key, plan.rest_pairs, pair.key);
-    if (at < plan.rest_pairs && plan.rest_key[at] == pair.key)
-      pair.thickness = plan.rest_thickness[at];
-    if (!(pair.thickness > T(0))) return false;  // a tie joins the sides
-  }
+  const std::int64_t at = find_sorted(plan.rest_key, plan.rest_pairs, pair.key);
+  if (at < plan.rest_pairs && plan.rest_key[at] == pair.key)
+    pair.thickness = plan.rest_thickness[at];
+  if (!(pair.thickness > T(0))) return false;  // a tie joins the sides, of one body or of two
   pair.friction = plan.friction[std::int64_t(first) * plan.bodies + last];
   return true;
 }

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...common.tables import PLANES, SPHERES
-from ..coarse import RigidMotions, correct, islands
+from ..coarse import correct, islands
 from ..envelopes import pushes_of
 from ..geometry import sphere_normals
 from ..pair_step import pair_envelopes
@@ -38,6 +38,7 @@ from .limit import Walls, into_balls, limit
 from .lists import Contacts, found
 from .prox import Multipliers, augmented_lagrangian, forces, prox, slips
 from .scene import ContactHistory, ContactScene
+from .thin import ThinMotions
 
 __all__ = ["ContactStep", "contact_step"]
 
@@ -256,7 +257,9 @@ class _Run:
         numbers, pairs = pairs_between(problem, contacts, near, x, self.begin)
         push = forces(contacts.pairs, near.weights, contacts.normals(near), contacts.held, len(x))
         gradient = np.where(problem.free[:, None], problem.gradient(u) - _array(push[: scene.count]), 0.0)
-        moved = correct(problem, u, pushes_of(problem, u, gradient), pairs, push_pairs=False, passes=PASSES)
+        moved = correct(
+            problem, u, pushes_of(problem, u, gradient), pairs, motions=ThinMotions, push_pairs=False, passes=PASSES
+        )
         rigid, swept, cut, places = moved.displacement - moved.pushes, False, False, x
         normal, tangential = contacts.held.normal.clone(), contacts.held.tangential.clone()
         pushes = torch.zeros_like(x)
@@ -264,7 +267,7 @@ class _Run:
             own = np.concatenate(bodies)
             if not (alone or len(of)) or not (moved.displacement[own] != u[own]).any():
                 continue
-            motions = RigidMotions(problem, u, bodies)
+            motions = ThinMotions(problem, u, bodies)
             ways = [
                 RigidWay.between(body, (problem.positions + u)[body], (problem.positions + rigid)[body], center)
                 for body, (center, _) in zip(motions.free, motions.bases, strict=True)
