@@ -147,8 +147,7 @@ class CoarseIsland {
  public:
   CoarseIsland() = default;
 
-  // `member`: [count] numbers of bodies. `matrix`: [6 count, 6 count], lower triangle column by column; `numbers`: three
-  // times [6 count]
+  // `member`: [count] numbers of bodies. `matrix`: `entries_of(count)`; `numbers`: three times [6 count]
   PD_HD CoarseIsland(CoarseBody* bodies, const int* member, int count, double* matrix,
                      double* numbers)
       : bodies_(bodies),
@@ -159,6 +158,11 @@ class CoarseIsland {
         way_(numbers + 6 * count),
         inverse_(numbers + 12 * count) {
     for (int n = 0; n < count; ++n) done_ = done_ && !body(n).moves();
+  }
+
+  // of the lower triangle [6 count, 6 count], column by column
+  PD_HD static std::int64_t entries_of(int count) {
+    return 3 * std::int64_t(count) * (6 * std::int64_t(count) + 1);
   }
 
   PD_HD bool is_done() const { return done_; }
@@ -210,7 +214,8 @@ class CoarseIsland {
   PD_HD CoarseBody& body(int n) const { return bodies_[member_[n]]; }
   PD_HD int rows() const { return 6 * count_; }
   PD_HD double& entry(int row, int column) const {
-    return matrix_[std::int64_t(column) * rows() + row];
+    const std::int64_t c = column;
+    return matrix_[c * rows() - c * (c + 1) / 2 + row];
   }
 
   PD_HD void add_body(int n, const double* sums) {

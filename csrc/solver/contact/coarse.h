@@ -267,7 +267,7 @@ class ContactCorrection {
       if (own == 0) continue;
       a_.island[g] = CoarseIsland(a_.coarse_body, a_.member + a_.first[g], own, matrix,
                                   a_.newton + 18 * a_.first[g]);
-      matrix += 36 * std::int64_t(own) * own;
+      matrix += CoarseIsland::entries_of(own);
       if (!a_.island[g].is_done()) numbers.searching = 1;
     }
   }

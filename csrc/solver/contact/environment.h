@@ -168,7 +168,7 @@ struct ContactArrays {
   CoarseBody* coarse_body;               // [components]
   CoarseIsland* island;                  // [components] by its least member
   RigidMotion<double>* motion;           // [components]
-  double *coarse_sum, *newton, *matrix;  // [components, 31], [components, 18], [components^2, 36]
+  double *coarse_sum, *newton, *matrix;  // [components, 31], [components, 18], of islands
   double *coarse_share, *coarse_joint, *coarse_limit;   // [components]
   int *root, *size, *first, *local, *member;            // [components] of islands
   int *component_begin, *component_end, *coarse_group;  // [components]
@@ -244,7 +244,7 @@ void arrange(Arena& arena, const ContactPlan<T>& plan, int components, ContactAr
   arena.place(a.motion, g);
   arena.place(a.coarse_sum, ContactSums::count * g);
   arena.place(a.newton, 18 * g);
-  arena.place(a.matrix, 36 * g * g);
+  arena.place(a.matrix, CoarseIsland::entries_of(int(g)));
   for (double** array : {&a.coarse_share, &a.coarse_joint, &a.coarse_limit}) arena.place(*array, g);
   for (int** array : {&a.root, &a.size, &a.first, &a.local, &a.member, &a.component_begin,
                       &a.component_end, &a.coarse_group})
