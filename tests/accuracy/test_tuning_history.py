@@ -7,6 +7,7 @@ import torch
 
 import torchpd as pd
 from torchpd.accuracy.error import settled_steps
+from torchpd.accuracy.tuning_study import make_study
 
 
 def dropped() -> tuple[pd.Simulator, pd.Collider]:
@@ -45,6 +46,15 @@ def test_the_bound_holds_in_another_motion_of_bodies_in_contact() -> None:
     state = thrown(sim, -0.5, -1.5, 0.2)
     (exact,) = settled_steps(sim, state)
     assert exact.error_beyond_rounding(sim(state).velocities[0].double().numpy() / 60, sim.dtype) > 0.1
+
+
+def test_bodies_that_meet_are_studied_at_other_speeds_too() -> None:
+    """Which pairs touch first depends on the speed, and so does what a step needs."""
+    sim, _ = dropped()
+    start = thrown(sim, 0.3, -1.0, 0.0)
+    studied = make_study(sim, start, None, 0.1).state.velocities
+    for speed in (0.6, 1.0, 1.3):
+        assert bool((studied == speed * start.velocities).flatten(1).all(dim=1).any())
 
 
 def test_a_plastic_bar_is_tuned() -> None:

@@ -285,6 +285,20 @@ def slope(
     return ContactCase(made, each(scene, tuple(turn @ np.array([speed, 0.0, 0.0]))))
 
 
+def dragged(friction: float, cells: int = 2, **options: Any) -> ContactCase:
+    """A block of .1 m whose top is held, on a mesh plane that rises by 2 mm in a step and then moves along x at 1 m/s."""
+    body = block(0.1, cells, center=(0.0, THICKNESS + 0.05, 0.0))
+    pin = pd.Pin(body, body.mesh.vertices[:, 1] > 0.1)
+    made = contact_scene(
+        falling(body, pin, g=0.0), plane_collider(0.6, 0.6, 4), thickness=THICKNESS, friction=friction, **options
+    )  # fmt: skip
+
+    def poses(t: float) -> Array:
+        return poses_of((max(t - H, 0.0), 2.0 * THICKNESS, 0.0))
+
+    return ContactCase(made, np.zeros_like(body.mesh.vertices), poses=poses)
+
+
 def stack(cells: int = 3, **options: Any) -> ContactCase:
     """A cube of 1 kg at rest, r above another one on the ground."""
     lower = block(0.1, cells, center=(0.0, 0.05, 0.0))

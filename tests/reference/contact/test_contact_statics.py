@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from contact_scenes import THICKNESS, G, H, gripper, mean_of, slope, stack
+from contact_scenes import THICKNESS, G, H, dragged, gripper, mean_of, slope, stack
 
 
 def test_a_cube_at_rest_on_a_mesh_plane() -> None:
@@ -41,6 +41,16 @@ def test_a_block_slides_down_a_slope(degrees: float, friction: float) -> None:
     rigid = 20 * H * G * (math.sin(angle) - friction * math.cos(angle))
     speed = float(torch.tensor(mean_of(case, step.velocities)).norm())
     assert rigid < speed < 1.03 * rigid
+
+
+def test_a_plane_drags_a_held_block() -> None:
+    """By friction times what it carries, in iterations alone: coarse corrections do not move what pins hold."""
+    case = dragged(0.5)
+    _, *dragging = case.steps(4, 16)
+    for step in dragging:
+        normal, along = float(step.contacts.held.normal.sum()), float(step.forces[: case.scene.count, 0].sum())
+        assert normal > 10.0
+        assert along == pytest.approx(0.5 * normal, rel=1e-3)
 
 
 def test_a_block_stops() -> None:
