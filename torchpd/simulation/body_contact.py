@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..common.rigid_motion import RigidBodies, refuse_gradients
 from ..ops.diagonal import named_material
 from ..ops.fake_kernels import CONTACT_FRICTION, CONTACT_RIGID
 from ..plan.contact_clusters import contact_clusters
@@ -21,7 +22,6 @@ from ..scene.rigid import RigidMass
 from ..scene.scene import SceneValues
 from ..scene.targets import ColliderInputs
 from .pair_forces import ContactSurfaces
-from .rigid_motion import RigidBodies, refuse_gradients
 from .state import ContactHistory, HistoryState, State
 
 __all__ = ["BodyContact"]
