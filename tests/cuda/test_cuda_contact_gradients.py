@@ -70,7 +70,7 @@ class Saved:
         sim, state = step.sim, step.state
         assert sim.body_contact is not None
         inputs = step.inputs()
-        start, keys, forces, _ = state.history
+        start, keys, forces, *_ = state.history
         poses = inputs.get("end", start)
         taken = torch.ops.torchpd.contact_step(
             state[0], state[1], None, poses, [start, keys, forces], sim.material(), plan_of(sim),

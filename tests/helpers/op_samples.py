@@ -99,7 +99,7 @@ def samples_of_contact(x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, 
     state: Any = sim.rest_state(BATCH)
     state.velocities[:, 8:, 1] = -0.5
     material, plan, contact = sim.material(), plan_of(sim), sim.body_contact.arrays
-    poses, keys, forces, _ = state.history
+    poses, keys, forces, *_ = state.history
     taken = torch.ops.torchpd.contact_step(
         *state[:2], None, poses, [poses, keys, forces], material, plan, contact, **settings_of(sim)
     )

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ..common.checks import check_scalar
+from ..common.rigid_motion import RigidBodies, refuse_gradients
 from ..ops.diagonal import named_material
 from ..ops.fake_kernels import CONTACT_FRICTION, CONTACT_RIGID, CONTACT_THICKNESS
 from ..plan.contact_clusters import contact_clusters
@@ -22,7 +23,6 @@ from ..scene.rigid import RigidMass
 from ..scene.scene import SceneValues
 from ..scene.targets import ColliderInputs
 from .pair_forces import ContactSurfaces
-from .rigid_motion import RigidBodies, refuse_gradients
 from .state import ContactHistory, HistoryState, State, widened
 
 __all__ = ["BodyContact"]

@@ -47,6 +47,7 @@ int main() {
   for (const double** array : {&plan.rest_thickness, &plan.rest, &plan.rest_apart, &plan.local,
                                &plan.cell, &plan.friction})
     *array = read<double>();
+  read<double>();  // no collider has a mass
   plan.thickness = *read<double>();
   const int* held = read<int>();
   const double *place = read<double>(), *target = read<double>();
@@ -64,7 +65,8 @@ int main() {
   }
   for (int n = 0; n < plan.points; ++n) a.surface[plan.point[n]] = 1;
   *a.numbers = {};
-  const ContactEnvironment<double> env{plan, a, {}, {}, nullptr, nullptr, nullptr, nullptr};
+  const ContactEnvironment<double> env{plan,    a,       {},      {},     nullptr,
+                                       nullptr, nullptr, nullptr, nullptr};
   const ContactSearch<double> search(env);
   const SerialTeam team;
   search.begin(team);

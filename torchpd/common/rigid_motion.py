@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..common.small_matrices import dot, inverse, length, product
+from .small_matrices import dot, inverse, length, product
 
 __all__ = ["FreeMotion", "RigidBodies", "refuse_gradients"]
 
@@ -148,5 +148,6 @@ def _turn_between(start: Tensor, end: Tensor) -> Tensor:
     own, of = end[..., :1], end[..., 1:]
     along = own * w - dot(of, axis)[..., None]
     across = own * axis + w * of + torch.linalg.cross(of, axis)
-    turn: Tensor = torch.where(along < 0.0, -2.0, 2.0).to(start.dtype) * across / along.abs().clamp(min=_HALF_TURN)
+    sign: Tensor = torch.where(along < 0.0, -2.0, 2.0).to(start.dtype)
+    turn: Tensor = sign * across / along.abs().clamp(min=_HALF_TURN)
     return turn
