@@ -63,10 +63,8 @@ struct CoarsePair {
 
   // The force at the gap and slip after motions.
   template <class Motion>
-  PD_HD Vec3<double> force_after(const Motion& motion_of) const {
-    const Envelope<double> of = envelope();
-    const Surface<double> at = after(move_of(motion_of));
-    return of.force(at, friction * of.normal_force(at.gap));
+  PD_HD Vec3<double> force_after(const Motion& motion_of, double radius) const {
+    return envelope().force(after(move_of(motion_of)), radius);
   }
 };
 

@@ -118,11 +118,16 @@ class ContactCorrection {
       if (!a_.joins[p]) return;
       const int root = root_of_pair(p);
       if (!is_valid(root)) return;
+      // those of the whole motion, which move colliders; else what is cut would be lost
+      const auto whole = [&](int g) -> const RigidMotion<double>& {
+        return a_.coarse_body[g].motion();
+      };
       const auto motion = [&](int g) -> const RigidMotion<double>& { return a_.motion[g]; };
       const CoarsePair pair = pair_at(p);
-      const Vec3<double> force = a_.coarse_share[root] < 1
-                                     ? pair.force_after(motion)
-                                     : pair.force_changed_by(motion, a_.radius[p]);
+      const Vec3<double> force =
+          has_collider(p)               ? pair.force_after(whole, a_.radius[p])
+          : a_.coarse_share[root] < 1 ? pair.force_after(motion, friction_after(pair, motion))
+                                      : pair.force_changed_by(motion, a_.radius[p]);
       const double normal = dot(force, pair.normal);
       a_.pair[p].force = {T(normal > 0 ? normal : 0.0), narrow(tangential(force, pair.normal))};
     });
@@ -183,6 +188,15 @@ class ContactCorrection {
   PD_HD int root_of_pair(int p) const {
     const int a = component_of(p, 0);
     return a_.root[a >= 0 ? a : component_of(p, 1)];
+  }
+  // with a mass
+  PD_HD bool has_collider(int p) const {
+    return component_of(p, 0) >= body_.components || component_of(p, 1) >= body_.components;
+  }
+  template <class Motion>
+  PD_HD static double friction_after(const CoarsePair& pair, const Motion& motion) {
+    const Surface<double> at = pair.after(pair.move_of(motion));
+    return pair.friction * pair.envelope().normal_force(at.gap);
   }
   PD_HD bool is_between(const ContactPair<T>& pair) const {
     return a_.component[pair.vertex[0]] != a_.component[pair.vertex[3]];

@@ -61,7 +61,8 @@ class ContactProx {
     Vec3<T> corner[4];
     pair.corners(a_.target, corner);
     const Vec3<T> between = combined(pair.near.weight, corner);
-    const bool acts = pair.force.normal > T(0) || !(pair.thickness <= dot(pair.normal, between)),
+    const bool acts = pair.force.normal > T(0) || !(pair.thickness <= dot(pair.normal, between)) ||
+                      (rigid_.exist() && rigid_.would_meet(pair)),
                active = acts && pair.can_yield(a_.inverse);
     if (acts && !active) pair.force = {};  // nothing can yield
     if constexpr (!Team::in_order) a_.row_of[p] = -1;

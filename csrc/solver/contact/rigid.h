@@ -9,7 +9,8 @@
 // What balances the torque takes that momentum: L_next = L - torque.
 // The prox of an iteration (solver/contact/prox.h) has t and w as six more unknowns, in this metric. So no momentum acts on
 // a collider: it is where its inertia and the forces of its pairs leave it. Each sweep solves for t and w first, with forces
-// of pairs that follow them by beta. Pairs then take the motion of their corners for given.
+// of pairs that follow them by beta, until they are still: then these forces balance its inertia. Pairs then take the motion
+// of their corners for given. A pair whose surfaces are near is active where the free motion would bring them too near.
 #pragma once
 #include "solver/contact/environment.h"
 
@@ -18,6 +19,9 @@ namespace pd::inline PD_TARGET {
 // Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
 constexpr double rigid_yield = 1e-3;
 constexpr double half_turn = 1e-9;  // least cosine of half of a turn
+constexpr int rigid_passes = 16;    // Newton's steps of a sweep; most take two
+constexpr double rigid_still = 1e-6;  // of the motion: a step that ends them
+constexpr double rigid_near = 2;      // thicknesses within which the free motion makes pairs active
 
 PD_HD Pose<double> widened(const Pose<float>& a) {
   return {widened<double>(a.origin), double(a.w), widened<double>(a.axis)};
@@ -129,14 +133,7 @@ class RigidColliders {
     team.spread(pairs, [&](int p) { a_.joins[p] = 0; });
     team.each(plan_.colliders, [&](int c) {
       a_.side_start[c] = 0;
-      if (!is_rigid(c)) return;
-      RigidCollider& of = a_.rigid_collider[c];
-      const RigidBody body = body_at(c, a_.hand[c].pose);
-      of.at = body.center;
-      of.length = body.square > 0 ? 1.0 / square_root(body.square) : 1.0;
-      of.pull = body.pull;
-      of.torque = axis_of(body.covariance);
-      of.shift = of.turn = {0, 0, 0};
+      if (is_rigid(c)) look(c);
     });
     team.each(active, [&](int q) {
       const Row row = rows_[q];
@@ -167,27 +164,33 @@ class RigidColliders {
     team.barrier();
   }
 
-  // Newton's step of all colliders by the forces that follow them. Then their corners move with them.
+  // Newton's steps of all colliders by the forces that follow them. Their corners move with them.
   template <class Team>
   PD_HD void move(const Team& team, int active, int moved) const {
+    ContactNumbers& numbers = env_.numbers();
     carry(team, moved);
-    team.each(active, [&](int q) {
-      if (a_.joins[rows_[q].pair()]) find_terms(rows_[q]);
-    });
-    team.groups(plan_.colliders, [&](int c, const auto& group) {
-      if (a_.side_start[c] == a_.side_start[c + 1]) return;
-      double sums[ContactSums::count] = {};
-      group.sum_range(
-          a_.side_start[c], a_.side_start[c + 1],
-          [&](int n, auto& sum) {
-            const int p = a_.side_pair[n];
-            add_terms(sum, a_.terms[p].of_side(side(a_.pair[p], 0) == c ? 0 : 1, false));
-          },
-          sums);
-      if (group.leads()) step(a_.rigid_collider[c], sums);
-    });
-    team.barrier();
-    carry(team, moved);
+    bool goes = true;
+    for (int pass = 0; goes && pass < rigid_passes; ++pass) {
+      team.spread(1, [&](int) { numbers.changed = 0; });
+      team.each(active, [&](int q) {
+        if (a_.joins[rows_[q].pair()]) find_terms(rows_[q]);
+      });
+      team.groups(plan_.colliders, [&](int c, const auto& group) {
+        if (a_.side_start[c] == a_.side_start[c + 1]) return;
+        double sums[ContactSums::count] = {};
+        group.sum_range(
+            a_.side_start[c], a_.side_start[c + 1],
+            [&](int n, auto& sum) {
+              const int p = a_.side_pair[n];
+              add_terms(sum, a_.terms[p].of_side(side(a_.pair[p], 0) == c ? 0 : 1, false));
+            },
+            sums);
+        if (group.leads() && step(a_.rigid_collider[c], sums)) numbers.changed = 1;
+      });
+      team.barrier();
+      goes = numbers.changed != 0;
+      carry(team, moved);
+    }
   }
 
   // After the sweeps: goals and targets, of colliders without a force the free motion.
@@ -205,6 +208,45 @@ class RigidColliders {
                 [&](int v, int c) { a_.target[v] = a_.hand[c].goal.place(local_point(plan_, v)); });
   }
 
+  // Of a pair that is near: whether free motions would bring it too near.
+  PD_HD bool would_meet(const ContactPair<T>& pair) const {
+    if (!(pair.near.distance < T(rigid_near) * pair.thickness)) return false;
+    Vec3<T> corner[4];
+    pair.corners(a_.target, corner);
+    bool some = false;
+    for (int n = 0; n < 4; ++n) {
+      const int v = pair.vertex[n], c = plan_.collider[v];
+      if (c < 0 || !is_rigid(c)) continue;
+      some = true;
+      corner[n] = a_.goal[v];
+    }
+    return some && !(pair.thickness <= dot(pair.normal, combined(pair.near.weight, corner)));
+  }
+
+  // At the end of a step: how far the forces on its vertices and its inertia would still move a collider [m].
+  template <class Group>
+  PD_HD double find_rest(int c, const Group& group) const {
+    using S = ContactSums;
+    RigidCollider& of = a_.rigid_collider[c];
+    if (group.leads()) look(c);
+    double wrench[6] = {};
+    const Vec3<double> at = widened(a_.hand[c].pose).place(of.center);
+    group.sum_range(
+        a_.hand[c].begin, a_.hand[c].end,
+        [&](int v, auto& sum) {
+          const Vec3<double> force = widened<double>(env_.force_on(v)),
+                             torque = cross(widened<double>(a_.place[v]) - at, force);
+          sum[0] += force.x, sum[1] += force.y, sum[2] += force.z;
+          sum[3] += torque.x, sum[4] += torque.y, sum[5] += torque.z;
+        },
+        wrench);
+    if (!group.leads()) return 0.0;
+    double sums[S::count] = {};
+    for (int n = 0; n < 6; ++n) sums[S::force + n] = wrench[n];
+    step(of, sums);
+    return square_root(dot(of.shift, of.shift) + dot(of.turn, of.turn) / (of.length * of.length));
+  }
+
   // Colliders stay where they are.
   template <class Team>
   PD_HD void stay(const Team& team) const {
@@ -214,6 +256,17 @@ class RigidColliders {
   }
 
  private:
+  // Its metric at the present pose.
+  PD_HD void look(int c) const {
+    RigidCollider& of = a_.rigid_collider[c];
+    const RigidBody body = body_at(c, a_.hand[c].pose);
+    of.at = body.center;
+    of.length = body.square > 0 ? 1.0 / square_root(body.square) : 1.0;
+    of.pull = body.pull;
+    of.torque = axis_of(body.covariance);
+    of.shift = of.turn = {0, 0, 0};
+  }
+
   template <class Team, class Visit>
   PD_HD void each_vertex(const Team& team, const Visit& visit) const {
     team.each(plan_.vertices - plan_.body_vertices, [&](int n) {
@@ -277,8 +330,8 @@ class RigidColliders {
     terms.across = bound > T(0) ? terms.along * (size > bound ? double(bound / size) : 1.0) : 0.0;
   }
 
-  // One step toward the balance of inertia and forces.
-  PD_HD void step(RigidCollider& of, const double (&sum)[ContactSums::count]) const {
+  // One step toward the balance of inertia and forces. Returns whether it moves.
+  PD_HD bool step(RigidCollider& of, const double (&sum)[ContactSums::count]) const {
     using S = ContactSums;
     const Vec3<double> force = subtract_product(of.pull, of.weight, of.shift),
                        torque = of.torque - of.inertia * of.turn;
@@ -299,8 +352,12 @@ class RigidColliders {
       }
     }
     solve_twist(terms, way);
-    of.shift = of.shift + Vec3<double>{way[0], way[1], way[2]};
-    of.turn = multiply_add(of.length, Vec3<double>{way[3], way[4], way[5]}, of.turn);
+    const Vec3<double> shift{way[0], way[1], way[2]}, turn{way[3], way[4], way[5]};
+    of.shift = of.shift + shift;
+    of.turn = multiply_add(of.length, turn, of.turn);
+    const double still = rigid_still / of.length;
+    return dot(shift, shift) + dot(turn, turn) >
+           rigid_still * rigid_still * dot(of.shift, of.shift) + still * still * dot(of.turn, of.turn);
   }
 
   const Env& env_;

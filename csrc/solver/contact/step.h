@@ -231,13 +231,18 @@ class ContactSteps {
       const Vec3<T> force = env_.force_on(v);
       T* const to = forces + 3 * std::int64_t(v);
       to[0] = force.x, to[1] = force.y, to[2] = force.z;
-      if (!env_.held(v) && v < plan_.body_vertices) return;
+      if (!env_.held(v)) return;
       const int number = v < plan_.body_vertices ? plan_.colliders : plan_.collider[v];
-      const Vec3<T> goal =
-          env_.held(v) ? a_.goal[v] : a_.hand[number].goal.place(local_point(plan_, v));
-      const Vec3<T> left = a_.place[v] - goal;
+      const Vec3<T> left = a_.place[v] - a_.goal[v];
       raise(a_.most + number, square_root(dot(left, left)));
     });
+    if (!rigid_.exist()) return;
+    team.groups(plan_.colliders, [&](int c, const auto& group) {
+      if (!rigid_.is_rigid(c)) return;
+      const double rest = rigid_.find_rest(c, group);
+      if (group.leads()) a_.most[c] = T(rest);
+    });
+    team.barrier();
   }
 
   // An overflow takes the step back: then nothing has changed, and no force acts.
@@ -448,7 +453,7 @@ class ContactSteps {
         move(i, none);
       });
     }
-    if (plan_.colliders > 0) move_hands(team);
+    if (plan_.colliders > 0) move_hands(team, measures, sums);
   }
 
   PD_HD void move_vertex(int v) const {
@@ -480,7 +485,7 @@ class ContactSteps {
 
   // Colliders by the largest shares of their screws that all their vertices allow.
   template <class Team>
-  PD_HD void move_hands(const Team& team) const {
+  PD_HD void move_hands(const Team& team, bool measures, double (&sums)[2]) const {
     ContactNumbers& numbers = env_.numbers();
     const int own = plan_.vertices - plan_.body_vertices;
     team.spread(1, [&](int) { numbers.stopped = 0; });
@@ -521,11 +526,24 @@ class ContactSteps {
     }
     team.each(plan_.colliders, [&](int c) { a_.share[c] = a_.least[c]; });
     team.each(plan_.colliders, [&](int c) { a_.hand[c].pose = a_.screw[c].at(a_.share[c]); });
-    team.each(own, [&](int n) {
+    const auto follow = [&](int n, double (&sum)[2]) {
       const int v = plan_.body_vertices + n, c = plan_.collider[v];
-      a_.place[v] = a_.hand[c].pose.place(local_point(plan_, v));
+      const Vec3<T> to = a_.hand[c].pose.place(local_point(plan_, v)), way = to - a_.place[v],
+                    off = to - a_.goal[v];
+      a_.place[v] = to;
       if (a_.share[c] < T(1)) cut(v);
-    });
+      if (!measures || !rigid_.is_rigid(c)) return;
+      sum[0] += double(dot(way, way));
+      sum[1] += double(dot(off, off));
+    };
+    if (measures && rigid_.exist()) {
+      team.sum(own, follow, sums);
+    } else {
+      team.each(own, [&](int n) {
+        double none[2] = {};
+        follow(n, none);
+      });
+    }
   }
 
   const Env& env_;
