@@ -34,7 +34,7 @@ class ContactProx {
     push(team, active, moved, true);
     if (rigid_.exist()) rigid_.begin(team, active);
     for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
-      if (rigid_.exist()) rigid_.move(team, active, moved);
+      if (rigid_.exist()) rigid_.move(team, active, moved, sweep == 0);
       team.template blocks<T>(
           active, [&](const auto& lanes) { advance(lanes, numbers.changes[sweep], sweep == 0); });
       // a further sweep would change nothing either

@@ -19,8 +19,7 @@ namespace pd::inline PD_TARGET {
 // Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
 constexpr double rigid_yield = 1e-3;
 constexpr double half_turn = 1e-9;  // least cosine of half of a turn
-constexpr int rigid_passes = 16;    // Newton's steps of a sweep; most take two
-constexpr double rigid_still = 1e-6;  // of the motion: a step that ends them
+constexpr int rigid_passes = 32;    // Newton's steps of a sweep; most take two. Four of eight are halves: others cycle
 constexpr double rigid_near = 2;      // thicknesses within which the free motion makes pairs active
 
 PD_HD Pose<double> widened(const Pose<float>& a) {
@@ -166,14 +165,14 @@ class RigidColliders {
 
   // Newton's steps of all colliders by the forces that follow them. Their corners move with them.
   template <class Team>
-  PD_HD void move(const Team& team, int active, int moved) const {
+  PD_HD void move(const Team& team, int active, int moved, bool first) const {
     ContactNumbers& numbers = env_.numbers();
     carry(team, moved);
     bool goes = true;
     for (int pass = 0; goes && pass < rigid_passes; ++pass) {
       team.spread(1, [&](int) { numbers.changed = 0; });
       team.each(active, [&](int q) {
-        if (a_.joins[rows_[q].pair()]) find_terms(rows_[q]);
+        if (a_.joins[rows_[q].pair()]) find_terms(rows_[q], first && pass == 0);
       });
       team.groups(plan_.colliders, [&](int c, const auto& group) {
         if (a_.side_start[c] == a_.side_start[c + 1]) return;
@@ -185,7 +184,8 @@ class RigidColliders {
               add_terms(sum, a_.terms[p].of_side(side(a_.pair[p], 0) == c ? 0 : 1, false));
             },
             sums);
-        if (group.leads() && step(a_.rigid_collider[c], sums)) numbers.changed = 1;
+        if (group.leads() && step(a_.rigid_collider[c], sums, (pass & 4) != 0 ? 0.5 : 1.0))
+          numbers.changed = 1;
       });
       team.barrier();
       goes = numbers.changed != 0;
@@ -243,7 +243,7 @@ class RigidColliders {
     if (!group.leads()) return 0.0;
     double sums[S::count] = {};
     for (int n = 0; n < 6; ++n) sums[S::force + n] = wrench[n];
-    step(of, sums);
+    step(of, sums, 1.0);
     return square_root(dot(of.shift, of.shift) + dot(of.turn, of.turn) / (of.length * of.length));
   }
 
@@ -304,8 +304,9 @@ class RigidColliders {
     });
   }
 
-  // The force that a pair would have after a sweep, and how it follows its corners.
-  PD_HD void find_terms(const Row& row) const {
+  // The force that a pair would have after a sweep, and how it follows its corners. `guess`: all pairs hold both ways, so
+  // that the first step does not go deep.
+  PD_HD void find_terms(const Row& row, bool guess) const {
     const auto vector = [&](int n) { return Vec3<T>{row[n], row[n + 1], row[n + 2]}; };
     Vec3<T> between = vector(Row::between);
     for (int corner = 0; corner < 4; ++corner) {
@@ -325,13 +326,15 @@ class RigidColliders {
     PairTerms& terms = a_.terms[p];
     terms.before = terms.after = terms.lag = terms.radius = 0;
     terms.normal = widened<double>(normal);
-    terms.force = widened<double>(multiply_add(next.normal, normal, next.tangential));
-    terms.along = both * double(beta);
+    const T held = guess ? multiply_add(beta, row[Row::thickness] - dot(normal, between), old.normal)
+                         : next.normal;
+    terms.force = widened<double>(multiply_add(held, normal, next.tangential));
+    terms.along = guess || next.normal > T(0) ? both * double(beta) : 0.0;
     terms.across = bound > T(0) ? terms.along * (size > bound ? double(bound / size) : 1.0) : 0.0;
   }
 
-  // One step toward the balance of inertia and forces. Returns whether it moves.
-  PD_HD bool step(RigidCollider& of, const double (&sum)[ContactSums::count]) const {
+  // A share of a step toward the balance of inertia and forces. Returns whether it moves.
+  PD_HD bool step(RigidCollider& of, const double (&sum)[ContactSums::count], double share) const {
     using S = ContactSums;
     const Vec3<double> force = subtract_product(of.pull, of.weight, of.shift),
                        torque = of.torque - of.inertia * of.turn;
@@ -353,11 +356,11 @@ class RigidColliders {
     }
     solve_twist(terms, way);
     const Vec3<double> shift{way[0], way[1], way[2]}, turn{way[3], way[4], way[5]};
-    of.shift = of.shift + shift;
-    of.turn = multiply_add(of.length, turn, of.turn);
-    const double still = rigid_still / of.length;
-    return dot(shift, shift) + dot(turn, turn) >
-           rigid_still * rigid_still * dot(of.shift, of.shift) + still * still * dot(of.turn, of.turn);
+    of.shift = multiply_add(share, shift, of.shift);
+    of.turn = multiply_add(share * of.length, turn, of.turn);
+    constexpr double still = sizeof(T) == 4 ? 1e-6 : 1e-10;
+    const double size = dot(of.shift, of.shift) + dot(of.turn, of.turn) / (of.length * of.length);
+    return dot(shift, shift) + dot(turn, turn) > still * still * size;
   }
 
   const Env& env_;
