@@ -124,10 +124,10 @@ class ContactCorrection {
       };
       const auto motion = [&](int g) -> const RigidMotion<double>& { return a_.motion[g]; };
       const CoarsePair pair = pair_at(p);
-      const Vec3<double> force =
-          has_collider(p)               ? pair.force_after(whole, a_.radius[p])
-          : a_.coarse_share[root] < 1 ? pair.force_after(motion, friction_after(pair, motion))
-                                      : pair.force_changed_by(motion, a_.radius[p]);
+      const Vec3<double> force = has_collider(p) ? pair.force_after(whole, a_.radius[p])
+                                 : a_.coarse_share[root] < 1
+                                     ? pair.force_after(motion, friction_after(pair, motion))
+                                     : pair.force_changed_by(motion, a_.radius[p]);
       const double normal = dot(force, pair.normal);
       a_.pair[p].force = {T(normal > 0 ? normal : 0.0), narrow(tangential(force, pair.normal))};
     });

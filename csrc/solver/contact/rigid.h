@@ -19,8 +19,9 @@ namespace pd::inline PD_TARGET {
 // Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
 constexpr double rigid_yield = 1e-3;
 constexpr double half_turn = 1e-9;  // least cosine of half of a turn
-constexpr int rigid_passes = 32;    // Newton's steps of a sweep; most take two. Four of eight are halves: others cycle
-constexpr double rigid_near = 2;      // thicknesses within which the free motion makes pairs active
+constexpr int rigid_passes =
+    32;  // Newton's steps of a sweep; most take two. Four of eight are halves: others cycle
+constexpr double rigid_near = 2;  // thicknesses within which the free motion makes pairs active
 
 PD_HD Pose<double> widened(const Pose<float>& a) {
   return {widened<double>(a.origin), double(a.w), widened<double>(a.axis)};
@@ -304,7 +305,7 @@ class RigidColliders {
     });
   }
 
-  // The force that a pair would have after a sweep, and how it follows its corners. `guess`: all pairs hold both ways, so
+  // The force that a pair would have after a sweep by the radius of friction before it, and how it follows its corners. `guess`: all pairs hold both ways, so
   // that the first step does not go deep.
   PD_HD void find_terms(const Row& row, bool guess) const {
     const auto vector = [&](int n) { return Vec3<T>{row[n], row[n + 1], row[n + 2]}; };
@@ -316,21 +317,23 @@ class RigidColliders {
     const T beta = row[Row::beta], friction = row[Row::friction];
     const Vec3<T> normal = vector(Row::normal), before = vector(Row::before);
     const Multiplier<T> old{row[Row::normal_force], vector(Row::tangential)},
-        next = pd::advance(old, beta, row[Row::thickness], friction, normal, between, before);
+        next = pd::advance(old, beta, row[Row::thickness], T(0), normal, between, before);
     const Vec3<T> pull = tangential(
         subtract_product(old.tangential, beta, tangential(between - before, normal)), normal);
-    const T size = square_root(dot(pull, pull)), bound = friction * next.normal;
+    const T size = square_root(dot(pull, pull)), bound = friction * old.normal;
     const int p = row.pair();
     // steps of two colliders at once, each with half of the pair
     const double both = side(a_.pair[p], 0) >= 0 && side(a_.pair[p], 1) >= 0 ? 2.0 : 1.0;
     PairTerms& terms = a_.terms[p];
     terms.before = terms.after = terms.lag = terms.radius = 0;
     terms.normal = widened<double>(normal);
-    const T held = guess ? multiply_add(beta, row[Row::thickness] - dot(normal, between), old.normal)
-                         : next.normal;
-    terms.force = widened<double>(multiply_add(held, normal, next.tangential));
+    const T held = guess
+                       ? multiply_add(beta, row[Row::thickness] - dot(normal, between), old.normal)
+                       : next.normal;
+    terms.force = widened<double>(multiply_add(held, normal, onto_disc(pull, bound)));
     terms.along = guess || next.normal > T(0) ? both * double(beta) : 0.0;
-    terms.across = bound > T(0) ? terms.along * (size > bound ? double(bound / size) : 1.0) : 0.0;
+    terms.across =
+        bound > T(0) ? both * double(beta) * (size > bound ? double(bound / size) : 1.0) : 0.0;
   }
 
   // A share of a step toward the balance of inertia and forces. Returns whether it moves.
