@@ -138,6 +138,64 @@ def test_a_rigid_block_stops_by_coulombs_law() -> None:
     assert float(state.history.motion[0, 1, 0]) == pytest.approx(2.0 - 10 * H * 0.4 * G, abs=1e-3)
 
 
+def sliding(
+    cells: int, z: float, iterations: int, time_step: float = H, tolerance: float | None = None
+) -> tuple[pd.Simulator, pd.Collider, pd.HistoryState]:
+    """A plate of 2 m/s, mu .4, on a table of square cells whose seams its edges pass; 10 m/s^2."""
+    plate = pd.Collider(shape((0.1, 0.02, 0.1), (2, 1, 2)), mass=0.7, pose=(-0.2, 0.01, z, 1, 0, 0, 0))
+    ground = pd.Collider(shape((2.0, 0.02, 2.0), (cells, 1, cells)), pose=(0, -0.01 - THICKNESS, 0, 1, 0, 0, 0))
+    scene = pd.Scene(soft(0.0, 1.0, 0.0), ground, plate, contact(0.4), pd.Gravity((0, -10, 0)))
+    options: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
+    sim = pd.Simulator(scene, time_step, iterations, dtype=torch.float64, progress=False, **options)
+    return sim, plate, with_motion(sim.rest_state(), 1, 2.0, 0, 0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("cells", [2, 6])
+@pytest.mark.parametrize("z", [0.0, 0.013])
+@pytest.mark.parametrize("iterations", [16, 64])
+def test_a_rigid_plate_slides_over_seams_by_coulombs_law(cells: int, z: float, iterations: int) -> None:
+    sim, _, state = sliding(cells, z, iterations)
+    state = sim.rollout(state, 10).state()
+    assert float(state.history.motion[0, 1, 0]) == pytest.approx(2.0 - 40 * H, abs=1e-3)
+
+
+@pytest.mark.parametrize("iterations", [1, 4, 16])
+@pytest.mark.parametrize("time_step", [1 / 60, 1 / 240])
+@pytest.mark.parametrize("z", [0.0, 0.013])
+@pytest.mark.parametrize("spin", [0.0, 5.0])
+def test_held_back_says_what_forces_do_not_account_for(
+    iterations: int, time_step: float, z: float, spin: float
+) -> None:
+    """m (v' - v) / h - m g - F and (L' - L) / h - T, as ways: by m / h^2, and by J / h^2 times the size of the plate."""
+    sim, plate, state = sliding(6, z, iterations, time_step)
+    state = with_motion(state, 1, 2.0, 0, 0, 0, spin, 0)
+    least, *_, most = np.linalg.eigvalsh(plate.inertia)
+    size = math.sqrt(0.5 * float(np.trace(plate.inertia)) / plate.mass)
+    for _ in range(10):
+        before, (state, info) = state, sim(state, return_info=True)
+        wrench = sim.contact_forces(before, state).on_colliders[0, 1]
+        change = (state.history.motion - before.history.motion)[0, 1, :3]
+        force = plate.mass * (change / time_step + torch.tensor([0.0, 10.0, 0.0])) - wrench[:3]
+        spins = angular_momentum(plate, state, 1) - angular_momentum(plate, before, 1)
+        torque = spins / time_step - wrench[3:]
+        shift, turn = float(force.norm()) * time_step**2 / plate.mass, float(torque.norm()) * time_step**2 * size
+        held = float(info.held_back)
+        assert math.hypot(shift, turn / most) <= 1.0001 * held + 1e-14
+        assert held <= 1.0001 * math.hypot(shift, turn / least) + 1e-14
+
+
+def test_a_tolerance_waits_for_colliders() -> None:
+    """The body falls freely, so that its own iterations are done at once."""
+    sim, _, state = sliding(6, 0.013, 256, tolerance=1e-9)
+    stopped = False
+    for _ in range(10):
+        state, info = sim(state, return_info=True)
+        assert float(info.held_back) < 1e-7
+        stopped = stopped or int(info.iterations) < 256
+    assert stopped
+    assert float(state.history.motion[0, 1, 0]) == pytest.approx(2.0 - 40 * H, abs=1e-3)
+
+
 def meeting(mass: float, iterations: int, friction: float = 0.0, **options: Any) -> tuple[pd.Simulator, Any, Any]:
     """A turned rigid cube flies into a free soft one."""
     cube, block = soft(0.0, 0.0, 0.0), rigid(mass, 0.02, 0.12, 0.013, turn=(0.97, 0.1, 0.15, 0.05))
