@@ -166,7 +166,7 @@ def test_a_rigid_plate_slides_over_seams_by_coulombs_law(cells: int, z: float, i
 def test_held_back_says_what_forces_do_not_account_for(
     iterations: int, time_step: float, z: float, spin: float
 ) -> None:
-    """m (v' - v) / h - m g - F and (L' - L) / h - T, as ways: by m / h^2, and by J / h^2 times the size of the plate."""
+    """m (v' - v) / h - m g - F and (L' - L) / h - T, as ways: by m / h^2, and by J / h^2 times the size."""
     sim, plate, state = sliding(6, z, iterations, time_step)
     state = with_motion(state, 1, 2.0, 0, 0, 0, spin, 0)
     least, *_, most = np.linalg.eigvalsh(plate.inertia)
@@ -190,7 +190,7 @@ def test_a_tolerance_waits_for_colliders() -> None:
     stopped = False
     for _ in range(10):
         state, info = sim(state, return_info=True)
-        assert float(info.held_back) < 1e-7
+        assert float(info.held_back) < 1e-6
         stopped = stopped or int(info.iterations) < 256
     assert stopped
     assert float(state.history.motion[0, 1, 0]) == pytest.approx(2.0 - 40 * H, abs=1e-3)
