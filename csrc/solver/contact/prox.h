@@ -35,8 +35,9 @@ class ContactProx {
     if (rigid_.exist()) rigid_.begin(team, active);
     for (int sweep = 0; sweep < contact_sweeps; ++sweep) {
       if (rigid_.exist()) rigid_.move(team, active, moved, sweep == 0);
-      team.template blocks<T>(
-          active, [&](const auto& lanes) { advance(lanes, numbers.changes[sweep], sweep == 0); });
+      team.template blocks<T>(active, [&](const auto& lanes) {
+        advance(lanes, numbers.changes[sweep], sweep == 0 && !rigid_.exist());
+      });
       // a further sweep would change nothing either
       if (!numbers.changes[sweep]) break;
       push(team, active, moved, false);

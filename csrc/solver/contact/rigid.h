@@ -210,7 +210,7 @@ class RigidColliders {
   }
 
   // Of a pair that is near: whether free motions would bring it too near.
-  PD_HD bool would_meet(const ContactPair<T>& pair) const {
+  PD_CALLED bool would_meet(const ContactPair<T>& pair) const {
     if (!(pair.near.distance < T(rigid_near) * pair.thickness)) return false;
     Vec3<T> corner[4];
     pair.corners(a_.target, corner);
@@ -226,7 +226,7 @@ class RigidColliders {
 
   // At the end of a step: how far the forces on its vertices and its inertia would still move a collider [m].
   template <class Group>
-  PD_HD double find_rest(int c, const Group& group) const {
+  PD_CALLED double find_rest(int c, const Group& group) const {
     using S = ContactSums;
     RigidCollider& of = a_.rigid_collider[c];
     if (group.leads()) look(c);
