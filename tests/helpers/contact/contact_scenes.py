@@ -286,7 +286,7 @@ def slope(
 
 
 def dragged(friction: float, cells: int = 2, **options: Any) -> ContactCase:
-    """A block of .1 m whose top is held, on a mesh plane that rises by 2 mm in a step and then moves along x at 1 m/s."""
+    """A block of .1 m, its top held, on a mesh plane that rises by 2 mm in a step and then moves along x at 1 m/s."""
     body = block(0.1, cells, center=(0.0, THICKNESS + 0.05, 0.0))
     pin = pd.Pin(body, body.mesh.vertices[:, 1] > 0.1)
     made = contact_scene(
