@@ -174,10 +174,7 @@ class Notices:
             )
 
     def after_growth(self, owner: object, capacity: int) -> None:
-        """Say once that a step is taken again with a larger capacity."""
-        if "growth" in self._said:
-            return
-        self._said.add("growth")
+        """Say that a step is taken again with a larger capacity."""
         warn_user(
             f"Simulator: more pairs of surfaces are near each other than the capacity of Contact, which is {capacity} "
             "from now on; the step is taken again, and so are later ones that need more. Contact(capacity=) with the "

@@ -155,8 +155,18 @@ def chosen(state: _Some, environments: Sequence[int]) -> _Some:
 
 def joined(states: Sequence[_Some]) -> _Some:
     """The environments of several states as one."""
-    others = [iter(_tensors_by_name(state).values()) for state in states]
+    others = [iter(_tensors_by_name(state).values()) for state in _equally_wide(states)]
     return _mapped(states[0], lambda _: torch.cat([next(tensors) for tensors in others]))
+
+
+def _equally_wide(states: Sequence[Any]) -> list[Any]:
+    """The same states, with room for as many pairs with forces in each."""
+    histories = [history_of(state[2]) if len(state) > 2 else None for state in states]
+    widths = [of.keys.shape[-1] for of in histories if isinstance(of, ContactHistory)]
+    return [
+        state._replace(history=widened(of, max(widths))) if isinstance(of, ContactHistory) else state
+        for state, of in zip(states, histories, strict=True)
+    ]
 
 
 def _moved(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
@@ -208,6 +218,7 @@ def _where(state: _Some, condition: Any, other: Any) -> _Some:
         raise TypeError(
             f"{kind.__name__}.where: other must be a {kind.__name__} with a {wanted}, got one with a {came}"
         )
+    state, other = _equally_wide([state, named_state(other)])
     theirs_of = _tensors_by_name(other)
     for name, mine in _tensors_by_name(state).items():
         theirs = theirs_of[name]

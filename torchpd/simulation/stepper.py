@@ -88,7 +88,7 @@ class Stepper(Readable):
                 contact.check_eager("Simulator")
                 contact = contact.with_capacity(max(contact.plan.capacity, state[2][1].shape[-1]))  # type: ignore[misc]
             after, rows = contact.step(state, forces, given, inputs, material, plan, settings)
-            while contact.plan.grows and (missing := int(Info.from_rows(rows).contact_overflow.max())):
+            while contact.plan.grows and (missing := _missing_pairs(rows)):
                 contact = contact.with_capacity(contact.plan.capacity + max(contact.plan.capacity, missing))
                 self._notices.after_growth(self, contact.plan.capacity)
                 after, rows = contact.step(state, forces, given, inputs, material, plan, settings)
@@ -390,6 +390,12 @@ class Stepper(Readable):
             targets: as in `forward`.
         """
         return step_gradient(self.checked_call(state, after, forces, targets))
+
+
+def _missing_pairs(rows: Tensor) -> int:
+    """Most pairs that the capacity lacks, over all environments. The host waits."""
+    missing = Info.from_rows(rows).contact_overflow
+    return int(missing.max()) if missing.numel() else 0
 
 
 def _first_iterate(start: str | Tensor, positions: Tensor) -> tuple[Tensor | None, bool]:
