@@ -304,6 +304,26 @@ def test_gradients_are_refused_by_name() -> None:
         sim(state).positions.sum().backward()
 
 
+def test_a_gradient_by_a_wrench_alone_is_refused_by_name() -> None:
+    sim, block, state = meeting(0.5, 4)
+    push = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    with pytest.raises(NotImplementedError, match="Collider has a mass"):
+        sim(state, targets={block: push}).history.motion.sum().backward()
+
+
+def test_a_compiled_step_has_the_same_bits() -> None:
+    sim, block, state = meeting(0.5, 4)
+    push = torch.tensor([0.0, -1.0, 0, 0, 0, 0.01]).double()
+
+    def run(state: pd.HistoryState, push: Tensor) -> pd.HistoryState:
+        return sim(state, targets={block: push})
+
+    found = torch.compile(run, fullgraph=True, backend="aot_eager")(state, push)
+    right = run(state, push)
+    for mine, its in zip((*found[:2], *found[2]), (*right[:2], *right[2]), strict=True):
+        assert torch.equal(mine, its)
+
+
 def test_a_saved_simulator_moves_alike(tmp_path: Path) -> None:
     sim, _, state = meeting(0.5, 8)
     sim.save(tmp_path / "sim.safetensors")

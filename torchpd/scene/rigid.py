@@ -48,8 +48,9 @@ def rigid_mass(mesh: TriMesh, mass: float, inertia: ArrayLike | None) -> RigidMa
     if inertia is None:
         if moment is None:
             raise ValueError(
-                f"Collider.inertia must be given for an open surface, got None and {len(mesh.triangles)} triangles "
-                "with a boundary; pass three moments [kg m^2], or close the surface"
+                "Collider.inertia must be given for an open surface, or one whose triangles are wound both ways, got "
+                f"None and {_loose_edges(mesh)} edges that do not join two triangles in opposite directions around a "
+                "volume; pass three moments [kg m^2], or close the surface and wind its triangles alike"
             )
         moment = mass * moment
         return RigidMass(mass, center, np.trace(moment) * np.eye(3) - moment)
@@ -78,12 +79,15 @@ def _inertia(value: ArrayLike) -> Array:
 
 def _is_closed(mesh: TriMesh) -> bool:
     """Whether each edge joins two triangles that pass it in opposite directions, around a volume."""
-    if mesh.volume() == 0.0:
-        return False
-    a, b = mesh.triangles, np.roll(mesh.triangles, -1, axis=1)
-    ways = np.stack([a.ravel(), b.ravel()], axis=1)
-    one, other = (np.unique(of, axis=0, return_counts=True) for of in (ways, ways[:, ::-1]))
-    return bool(one[1].max() == 1 and np.array_equal(one[0], other[0]))
+    return mesh.volume() != 0.0 and _loose_edges(mesh) == 0
+
+
+def _loose_edges(mesh: TriMesh) -> int:
+    """Edges that do not join two triangles which pass them in opposite directions."""
+    ways = np.stack([mesh.triangles.ravel(), np.roll(mesh.triangles, -1, axis=1).ravel()], axis=1)
+    _, edge, count = np.unique(np.sort(ways, axis=1), axis=0, return_inverse=True, return_counts=True)
+    forward = np.bincount(edge.ravel(), weights=ways[:, 0] < ways[:, 1])
+    return int(np.count_nonzero((count != 2) | (forward != 1)))
 
 
 def _solid(corners: Array) -> tuple[Array, Array]:
