@@ -81,8 +81,8 @@ def test_friction_may_name_two_colliders_of_which_one_has_a_mass() -> None:
 
 
 def test_a_closed_surface_wound_both_ways_has_no_moments_of_its_own() -> None:
-    box = pd.shapes.box((0.1, 0.1, 0.1), (1, 1, 1)).boundary()
-    triangles = box.triangles.copy()
+    box = pd.shapes.box((0.1, 0.1, 0.1), (1, 1, 1))
+    triangles = box.boundary().copy()
     triangles[0] = triangles[0, ::-1]
     with pytest.raises(ValueError, match="None and 3 edges that do not join two triangles in opposite directions"):
         pd.Collider(pd.TriMesh(box.vertices, triangles), mass=1.0)
