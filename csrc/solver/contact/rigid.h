@@ -19,8 +19,8 @@ namespace pd::inline PD_TARGET {
 // Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
 constexpr double rigid_yield = 1e-3;
 constexpr double half_turn = 1e-9;  // least cosine of half of a turn
-// Newton's steps of a sweep: most take two. Later ones are halves, as some cycle.
-constexpr int rigid_passes = 12, rigid_full = 8;
+// Newton's steps of a sweep: most take two. Four of eight are halves, as some cycle.
+constexpr int rigid_passes = 32;
 constexpr double rigid_near = 2;  // thicknesses within which the free motion makes pairs active
 
 PD_HD Pose<double> widened(const Pose<float>& a) {
@@ -185,7 +185,7 @@ class RigidColliders {
               add_terms(sum, a_.terms[p].of_side(side(a_.pair[p], 0) == c ? 0 : 1, false));
             },
             sums);
-        if (group.leads() && step(a_.rigid_collider[c], sums, pass < rigid_full ? 1.0 : 0.5))
+        if (group.leads() && step(a_.rigid_collider[c], sums, (pass & 4) != 0 ? 0.5 : 1.0))
           numbers.changed = 1;
       });
       team.barrier();
@@ -361,7 +361,7 @@ class RigidColliders {
     const Vec3<double> shift{way[0], way[1], way[2]}, turn{way[3], way[4], way[5]};
     of.shift = multiply_add(share, shift, of.shift);
     of.turn = multiply_add(share * of.length, turn, of.turn);
-    constexpr double still = sizeof(T) == 4 ? 1e-6 : 1e-9;
+    constexpr double still = sizeof(T) == 4 ? 1e-6 : 1e-10;
     const double size = dot(of.shift, of.shift) + dot(of.turn, of.turn) / (of.length * of.length);
     return dot(shift, shift) + dot(turn, turn) > still * still * size;
   }
