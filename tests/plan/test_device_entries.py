@@ -79,7 +79,7 @@ def test_lanes_that_write_forces_seldom_meet() -> None:
 
 
 def test_large_and_single_patches_keep_the_order_of_pairs() -> None:
-    """Large ones go through no pipeline, and may need every entry that 16 bits count. Single ones sum as kernel block."""
+    """Large ones go through no pipeline, and may need all entries that 16 bits count. Single ones sum like `block`."""
     single = [case for case in CASES if case[1] == 1]
     assert {"full patch", "held box", "slivers"} <= {name for name, _ in single}
     for case in single:
