@@ -96,7 +96,7 @@ def case(several: bool, seed: int, noise: float, way: float) -> Case:
 
 def search(program: Path, of: Case, capacity: int | None = None) -> Found:
     plan, arrays = of.plan, of.contact.arrays
-    bodies, colliders, given, points, edges = arrays[0].tolist()
+    bodies, colliders, given, points, edges, _ = arrays[0].tolist()
     sizes = [
         len(plan.body), len(of.plan.shape), len(plan.triangles), len(plan.edges), len(plan.vertices), bodies, colliders,
         given if capacity is None else capacity, len(arrays[8]), points, edges, len(plan.near.keys),

@@ -152,7 +152,8 @@ def _in_chunks(
 def _as_wide(chunks: list[tuple[Tensor, ...]]) -> list[tuple[Tensor, ...]]:
     """Chunks whose histories have room for as many pairs; a capacity that grows makes later ones wider."""
     histories = [history_of(chunk[3:]) if len(chunk) > 3 else None for chunk in chunks]
-    widest = max((h.keys.shape[-1] for h in histories if isinstance(h, ContactHistory)), default=0)
+    widths = [history.keys.shape[-1] for history in histories if isinstance(history, ContactHistory)]
+    widest = max(widths) if widths else 0
     return [
         (*chunk[:3], *widened(history, widest)) if isinstance(history, ContactHistory) else chunk
         for chunk, history in zip(chunks, histories, strict=True)
