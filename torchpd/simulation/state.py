@@ -259,8 +259,8 @@ class Info(NamedTuple):
         contact_overflow: pairs that `Contact.capacity` lacks. Where it is positive, positions, velocities and history
             stay as before the step. 0 without `Contact`.
         held_back: largest distance that a pinned vertex or a vertex of a `Collider` stays behind its target because
-            bodies are in the way [m]. Of a `Collider` with a mass, how far its inertia and the forces of its pairs would
-            still move it. 0 without `Contact`.
+            bodies are in the way [m]. Of a `Collider` with a mass, how far its inertia and the forces of its pairs
+            would still move it. 0 without `Contact`.
     The residual is (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). Here r is the part of grad E [N] that
     neither pins nor contacts balance. f_i = a_i (u_i - s_i) is the force of inertia, weight and springs on vertex i,
     and e_i that of its elements. S x is the sum of stiffness times position (csrc/solver/report.h), so 4 eps |S x|
