@@ -140,14 +140,15 @@ def test_a_rigid_block_stops_by_coulombs_law() -> None:
 
 def sliding(
     cells: int, z: float, iterations: int, time_step: float = H, tolerance: float | None = None
-) -> tuple[pd.Simulator, pd.Collider, pd.HistoryState]:
+) -> tuple[pd.Simulator, Any, Any]:
     """A plate of 2 m/s, mu .4, on a table of square cells whose seams its edges pass; 10 m/s^2."""
     plate = pd.Collider(shape((0.1, 0.02, 0.1), (2, 1, 2)), mass=0.7, pose=(-0.2, 0.01, z, 1, 0, 0, 0))
     ground = pd.Collider(shape((2.0, 0.02, 2.0), (cells, 1, cells)), pose=(0, -0.01 - THICKNESS, 0, 1, 0, 0, 0))
     scene = pd.Scene(soft(0.0, 1.0, 0.0), ground, plate, contact(0.4), pd.Gravity((0, -10, 0)))
     options: dict[str, Any] = {} if tolerance is None else {"tolerance": tolerance}
     sim = pd.Simulator(scene, time_step, iterations, dtype=torch.float64, progress=False, **options)
-    return sim, plate, with_motion(sim.rest_state(), 1, 2.0, 0, 0, 0, 0, 0)
+    start: Any = sim.rest_state()
+    return sim, plate, with_motion(start, 1, 2.0, 0, 0, 0, 0, 0)
 
 
 @pytest.mark.parametrize("cells", [2, 6])
