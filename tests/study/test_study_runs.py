@@ -47,7 +47,8 @@ def test_files_and_their_schema(quick: tuple[Path, str]) -> None:
         "subject",
         "rows",
     }
-    assert record["command"] == f"python -m torchpd study beam --resolution 1 --out {out} --quick"
+    # folders of this machine are left out
+    assert record["command"] == f"python -m torchpd study beam --resolution 1 --out {out.name} --quick"
     rows = [Row.from_json(row) for row in record["rows"]]
     assert {row.axis for row in rows} == set(AXES)
     assert [row.iterations for row in rows if row.axis == "stiffness" and row.youngs == 1e4][:3] == [1, 2, 3]

@@ -104,7 +104,7 @@ class _Refused(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *_: Any) -> Any:
-        raise NotImplementedError(
+        raise RuntimeError(
             "gradients of a step must not be asked where a Collider has a mass, got backward() through one; give the "
             "Collider mass=None and its pose as a target, or detach() the state (docs/limits.md)"
         )
