@@ -195,7 +195,7 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   const ContactMemory<T>& memory_;
   std::int64_t e_;
   ContactEnvironment<T> env_;
-  ContactSteps<T> steps_;
+  ContactSteps<T, true> steps_;
   SerialTeam alone_;
   double residual_ = NAN;
   bool begun_ = false;

@@ -128,9 +128,9 @@ PD_DEVICE ContactEnvironment<T> environment_of(const ContactKernel<T>& call,
           plan.rigid + (plan.rigid ? rigid_numbers * e * plan.colliders : 0)};
 }
 
-template <class T>
-PD_DEVICE void iterate(const ContactKernel<T>& call, const ContactSteps<T>& steps,
-                       const ContactTeam& team, std::int64_t e, int k, bool leads) {
+template <class T, class Steps>
+PD_DEVICE void iterate(const ContactKernel<T>& call, const Steps& steps, const ContactTeam& team,
+                       std::int64_t e, int k, bool leads) {
   const ContactWork<T>& w = call.work;
   Progress& p = static_cast<Progress*>(w.progress)[e];
   if (p.done) return;
@@ -168,8 +168,8 @@ PD_DEVICE bool asks_correction(const ContactKernel<T>& call, const ContactNumber
          (call.trial == 0 || numbers.cuts);
 }
 
-template <class T>
-PD_DEVICE void begin_correction(const ContactKernel<T>& call, const ContactSteps<T>& steps,
+template <class T, class Steps>
+PD_DEVICE void begin_correction(const ContactKernel<T>& call, const Steps& steps,
                                 const ContactTeam& team, ContactNumbers& numbers, std::int64_t e) {
   bool corrects = false;
   if (asks_correction(call, numbers, e)) {
@@ -180,9 +180,9 @@ PD_DEVICE void begin_correction(const ContactKernel<T>& call, const ContactSteps
   team.spread(1, [&](int) { call.memory.is_correct[e] = !corrects; });
 }
 
-template <class T>
-PD_DEVICE void correct(const ContactKernel<T>& call, const ContactSteps<T>& steps,
-                       const ContactTeam& team, const ContactNumbers& numbers, std::int64_t e) {
+template <class T, class Steps>
+PD_DEVICE void correct(const ContactKernel<T>& call, const Steps& steps, const ContactTeam& team,
+                       const ContactNumbers& numbers, std::int64_t e) {
   if (!numbers.corrects) return;
   const ContactWork<T>& w = call.work;
   const int walls = w.material.planes_count + w.material.spheres_count;
@@ -239,7 +239,8 @@ constexpr int blocks_at_once(ContactTask task) {
   return sizeof(T) == 8 ? 2 : task == ContactTask::iterate ? 6 : 4;
 }
 
-template <ContactTask What, class T>
+// `HasRigid`: with colliders that have a mass.
+template <ContactTask What, class T, bool HasRigid>
 __global__ void __launch_bounds__(contact_threads, blocks_at_once<T>(What))
     contact_task(const __grid_constant__ ContactKernel<T> call) {
   __shared__ ContactArrays<T> arrays;
@@ -279,7 +280,7 @@ __global__ void __launch_bounds__(contact_threads, blocks_at_once<T>(What))
       __syncthreads();
     }
     const ContactEnvironment<T> environment = environment_of(call, arrays, e);
-    const ContactSteps<T> steps(environment);
+    const ContactSteps<T, HasRigid> steps(environment);
     T* const forces = w.contact.forces + 3 * e * plan.vertices;
     if constexpr (What == ContactTask::start) {
       steps.start(team);
@@ -316,11 +317,11 @@ __global__ void contact_components(const __grid_constant__ ContactKernel<T> call
     call.memory.component[call.work.slot_vertex[s]] = call.work.slot_piece[s];
 }
 
-template <ContactTask What, class T>
+template <ContactTask What, class T, bool HasRigid>
 void launch_contact(const ContactWork<T>& work, int k, int trial, cudaStream_t stream) {
   ContactKernel<T> call{work, {}, count_chunks(work), 0, 0, k, trial};
   arrange(work, work.memory, call.memory);
-  const auto* kernel = reinterpret_cast<const void*>(contact_task<What, T>);
+  const auto* kernel = reinterpret_cast<const void*>(contact_task<What, T, HasRigid>);
   const std::size_t shared = shared_bytes_of<T>(What);
   const int resident = resident_blocks(kernel, contact_threads, shared);
   const ContactPlan<T>& plan = work.contact.plan;
@@ -331,7 +332,7 @@ void launch_contact(const ContactWork<T>& work, int k, int trial, cudaStream_t s
   call.blocks = teams.blocks;
   if (call.blocks > 1)
     return launch_teams(kernel, call, call.memory.counter, contact_threads, shared, stream);
-  contact_task<What, T><<<unsigned(call.teams), contact_threads, shared, stream>>>(call);
+  contact_task<What, T, HasRigid><<<unsigned(call.teams), contact_threads, shared, stream>>>(call);
   check(cudaGetLastError());
 }
 
@@ -372,13 +373,13 @@ void keep_displacements(const ContactWork<T>& work, Stream to) {
                         cudaMemcpyDeviceToDevice, static_cast<cudaStream_t>(to)));
 }
 
-template <class T>
-void run_contact(ContactTask task, const ContactWork<T>& work, int k, int trial, Stream to) {
+template <class T, bool HasRigid>
+void run_contact_task(ContactTask task, const ContactWork<T>& work, int k, int trial, Stream to) {
   const auto stream = static_cast<cudaStream_t>(to);
   switch (task) {
 #define X(name)           \
   case ContactTask::name: \
-    return launch_contact<ContactTask::name>(work, k, trial, stream);
+    return launch_contact<ContactTask::name, T, HasRigid>(work, k, trial, stream);
     X(look_for_free)
     X(start)
     X(go_first)

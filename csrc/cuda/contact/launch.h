@@ -63,9 +63,15 @@ struct ContactFlags {
 template <class T>
 ContactFlags contact_flags(const ContactWork<T>& work);
 
-// `k`: iteration; `trial`: of its coarse correction
+// `k`: iteration; `trial`: of its coarse correction; `HasRigid`: with colliders that have a mass
+template <class T, bool HasRigid>
+void run_contact_task(ContactTask task, const ContactWork<T>& work, int k, int trial,
+                      Stream stream);
 template <class T>
-void run_contact(ContactTask task, const ContactWork<T>& work, int k, int trial, Stream stream);
+void run_contact(ContactTask task, const ContactWork<T>& work, int k, int trial, Stream stream) {
+  const auto run = work.contact.plan.rigid ? run_contact_task<T, true> : run_contact_task<T, false>;
+  run(task, work, k, trial, stream);
+}
 
 // Keeps the displacements, before a coarse correction.
 template <class T>

@@ -351,7 +351,7 @@ class ContactTeam {
   PD_DEVICE static void block_reduce(double (&value)[Count], Op op) {
     static_assert(Count <= most_contact_sums);
     constexpr int warps = contact_threads / warp_size;
-    __shared__ double of_warp[warps][most_contact_sums];
+    double (&of_warp)[warps][most_contact_sums] = sums_of_warps();
     for (int n = 0; n < Count; ++n) value[n] = warp_reduce(value[n], op);
     if (threadIdx.x % warp_size == 0) {
       for (int n = 0; n < Count; ++n) of_warp[threadIdx.x / warp_size][n] = value[n];
@@ -362,6 +362,13 @@ class ContactTeam {
       for (int warp = 1; warp < warps; ++warp) value[n] = op(value[n], of_warp[warp][n]);
     }
     __syncthreads();
+  }
+
+  // One for all sums of a kernel: a function of a template would have one for each kind.
+  PD_DEVICE static auto sums_of_warps()
+      -> double (&)[contact_threads / warp_size][most_contact_sums] {
+    __shared__ double sums[contact_threads / warp_size][most_contact_sums];
+    return sums;
   }
 
   // The sum over earlier threads of the block; `total`: over all.

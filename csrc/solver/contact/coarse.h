@@ -18,7 +18,7 @@ namespace pd::inline PD_TARGET {
 constexpr double turn_bow = 0.25;
 constexpr int coarse_halvings = 6;  // of the interval of a share
 
-template <class T>
+template <class T, bool HasRigid>
 class ContactCorrection {
  public:
   using Env = ContactEnvironment<T>;
@@ -52,7 +52,7 @@ class ContactCorrection {
     });
     if (!numbers.corrects) return;
     team.groups(body_.components, [&](int g, const auto& group) { sum_body(g, group); });
-    team.each(count - body_.components, [&](int c) {
+    team.each(rigid_.count(), [&](int c) {
       const int g = body_.components + c;
       a_.coarse_body[g] = CoarseBody(rigid_.body_at(c, a_.hand[c].pose));
       a_.goes[g] = a_.coarse_body[g].moves();
@@ -154,7 +154,7 @@ class ContactCorrection {
       }
       a_.target[v] = env_.held(v) ? a_.goal[v] : a_.place[v] + push;
     });
-    team.each(env_.components() - body_.components, [&](int c) {
+    team.each(rigid_.count(), [&](int c) {
       const int g = body_.components + c;
       Hand<T>& hand = a_.hand[c];
       if (a_.goes[g] && is_valid(a_.root[g]) && a_.coarse_share[a_.root[g]] > 0)
@@ -408,7 +408,7 @@ class ContactCorrection {
   }
 
   PD_HD Vec3<T> place_after(int v, const RigidMotion<double>& motion) const {
-    if (v >= plan_.body_vertices)
+    if (rigid_.exist() && v >= plan_.body_vertices)
       return pose_after(plan_.collider[v], motion).place(local_point(plan_, v));
     const int i = a_.inside[v];
     const Vec3<T> u = BodyState<T>::read(body_.u, i) + narrow(motion.of(position(i)));
@@ -549,7 +549,7 @@ class ContactCorrection {
   const ContactArrays<T>& a_;
   const BodyState<T>& body_;
   const ContactSearch<T> search_;
-  const RigidColliders<T> rigid_;
+  const RigidColliders<T, HasRigid> rigid_;
 };
 
 }  // namespace pd::inline PD_TARGET

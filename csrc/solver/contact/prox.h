@@ -8,7 +8,7 @@
 
 namespace pd::inline PD_TARGET {
 
-template <class T>
+template <class T, bool HasRigid>
 class ContactProx {
  public:
   using Env = ContactEnvironment<T>;
@@ -100,8 +100,10 @@ class ContactProx {
   // How forces move the vertices; `first`: and S of every vertex.
   template <class Team>
   PD_HD void push(const Team& team, int active, int moved, bool first) const {
-    const auto add = [&](const Row& row, int corner, T& weight, Four<T>& by) {
-      const Four<T> force{row[Row::force], row[Row::force + 1], row[Row::force + 2], T(0)};
+    const auto force_of = [](const Row& row) {
+      return Four<T>{row[Row::force], row[Row::force + 1], row[Row::force + 2], T(0)};
+    };
+    const auto add = [&](const Row& row, const Four<T>& force, int corner, T& weight, Four<T>& by) {
       if (first) weight = weight + absolute(row[Row::weight + corner]);
       by = multiply_add(row[Row::moves + corner], force, by);
     };
@@ -112,10 +114,11 @@ class ContactProx {
       });
       team.each(active, [&](int q) {
         const Row row = rows_[q];
+        const Four<T> force = force_of(row);
         PD_UNROLL
         for (int corner = 0; corner < 4; ++corner) {
           const int v = row.vertex(corner);
-          add(row, corner, a_.weight[v], a_.moved_by[v]);
+          add(row, force, corner, a_.weight[v], a_.moved_by[v]);
         }
       });
     } else {
@@ -126,7 +129,7 @@ class ContactProx {
         PD_UNROLL_4
         for (int entry = a_.start[v]; entry < end; ++entry) {
           const int corner = a_.corner[entry], q = a_.row_of[corner / 4];
-          if (q >= 0) add(rows_[q], corner % 4, weight, by);
+          if (q >= 0) add(rows_[q], force_of(rows_[q]), corner % 4, weight, by);
         }
         a_.moved_by[v] = by;
         if (first) a_.weight[v] = weight;
@@ -181,7 +184,7 @@ class ContactProx {
   const Env& env_;
   const ContactArrays<T>& a_;
   const ActiveRows<T> rows_;
-  const RigidColliders<T> rigid_;
+  const RigidColliders<T, HasRigid> rigid_;
 };
 
 }  // namespace pd::inline PD_TARGET

@@ -43,7 +43,8 @@ PD_HD Pose<T> moved(const Pose<T>& from, const Vec3<double>& center, const Vec3<
           {T(about.axis.x), T(about.axis.y), T(about.axis.z)}};
 }
 
-template <class T>
+// `MayExist`: without it their code is left out.
+template <class T, bool MayExist>
 class RigidColliders {
  public:
   using Env = ContactEnvironment<T>;
@@ -52,7 +53,8 @@ class RigidColliders {
   PD_HD explicit RigidColliders(const Env& env)
       : env_(env), plan_(env.plan), a_(env.a), rows_{env.a.first_rows, env.a.rows} {}
 
-  PD_HD bool exist() const { return plan_.rigid != nullptr; }
+  PD_HD bool exist() const { return MayExist && plan_.rigid != nullptr; }
+  PD_HD int count() const { return exist() ? plan_.colliders : 0; }
   PD_HD bool is_rigid(int c) const { return exist() && a_.rigid_collider[c].weight > 0; }
 
   // At the start of a step: their vertices do not move by hand.

@@ -8,7 +8,8 @@
 
 namespace pd::inline PD_TARGET {
 
-template <class T>
+// `HasRigid`: with colliders that have a mass.
+template <class T, bool HasRigid>
 class ContactSteps {
  public:
   using Env = ContactEnvironment<T>;
@@ -97,7 +98,7 @@ class ContactSteps {
       a_.cut[v] = 0;
       if (!env_.held(v) && approach.was_stopped(plan_.body[v])) a_.target[v] = a_.place[v];
     });
-    team.spread(rigid_.exist() ? plan_.colliders : 0, [&](int c) {
+    team.spread(rigid_.count(), [&](int c) {
       Hand<T>& hand = a_.hand[c];
       if (rigid_.is_rigid(c) && approach.was_stopped(plan_.body[hand.begin])) hand.goal = hand.pose;
     });
@@ -551,9 +552,9 @@ class ContactSteps {
   const ContactArrays<T>& a_;
   const BodyState<T>& body_;
   const ContactSearch<T> search_;
-  const ContactCorrection<T> correction_;
-  const ContactProx<T> prox_;
-  const RigidColliders<T> rigid_;
+  const ContactCorrection<T, HasRigid> correction_;
+  const ContactProx<T, HasRigid> prox_;
+  const RigidColliders<T, HasRigid> rigid_;
 };
 
 }  // namespace pd::inline PD_TARGET
