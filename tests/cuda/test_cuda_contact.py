@@ -279,7 +279,7 @@ def test_the_host_does_not_wait() -> None:
     sim = on_gpu(course, 8, torch.float32)
     state = course.start(sim)
     targets = {part: value.to(sim.rest_positions) for part, value in course.targets(0).items()}  # type: ignore[misc]
-    sim(state, targets=targets)
+    sim(state, targets=targets, return_info=True)  # the host waits for the first launch of a kernel
     assert not host_waits(lambda: sim(state, targets=targets, return_info=True))
 
 

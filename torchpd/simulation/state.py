@@ -285,15 +285,16 @@ class Info(NamedTuple):
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """Build it from rows of a step [..., 7], with `Contact` [..., 10]; files without `inverted` have 6 columns."""
-        residual, energy, iterations, restarts, converged, rho, *counted = rows.unbind(-1)
-        inverted = counted[0] if counted else torch.full_like(rho, -1.0)
-        of_step = residual, energy, iterations.long(), restarts.long(), converged.bool(), rho, inverted.long()
+        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 10]; files without `inverted` have 6 columns."""
+        residual, energy, _, _, converged, rho, *counted = rows.unbind(-1)
+        # one pass for all columns; what it makes of those that are no whole numbers is not read
+        _, _, iterations, restarts, _, _, *whole = rows.long().unbind(-1)
+        inverted = whole[0] if whole else torch.full_like(iterations, -1)
+        of_step = residual, energy, iterations, restarts, converged.bool(), rho, inverted
         if len(counted) < 4:
-            gap, overflow = torch.full_like(rho, math.inf), torch.zeros_like(inverted, dtype=torch.int64)
-            return cls(*of_step, gap, overflow, torch.zeros_like(rho))
-        gap, missing, held_back = counted[1:]
-        return cls(*of_step, gap, missing.long(), held_back)
+            none = torch.zeros_like(iterations)
+            return cls(*of_step, torch.full_like(rho, math.inf), none, none.view(rho.dtype))
+        return cls(*of_step, counted[1], whole[2], counted[3])
 
     def __repr__(self) -> str:
         try:
