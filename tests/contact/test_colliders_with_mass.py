@@ -13,7 +13,7 @@ from body_scenes import THICKNESS, G, H, crossed, gravity, simulator
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.common.rigid_motion import _rotation
+from torchpd.scene.contact import placed
 from torchpd.ops.fake_kernels import CONTACT_RIGID
 from torchpd.simulation.state import chosen
 
@@ -55,7 +55,9 @@ def with_motion(state: pd.HistoryState, collider: int, *motion: float) -> pd.His
 
 def angular_momentum(collider: pd.Collider, state: pd.HistoryState, number: int) -> Tensor:
     """About its centre of mass [3]."""
-    turn = _rotation(state.history.poses[0, number, 3:])  # type: ignore[union-attr]
+    pose = state.history.poses[0, number].clone()  # type: ignore[union-attr]
+    pose[:3] = 0.0
+    turn = torch.tensor(placed(pose[None].numpy(), np.eye(3))).T
     inertia = turn @ torch.tensor(collider.inertia) @ turn.T
     return inertia @ state.history.motion[0, number, 3:]  # type: ignore[union-attr]
 

@@ -18,7 +18,6 @@ namespace pd::inline PD_TARGET {
 
 // Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
 constexpr double rigid_yield = 1e-3;
-constexpr double half_turn = 1e-9;  // least cosine of half of a turn
 // Newton's steps of a sweep: most take two. Four of eight are halves, as some cycle.
 constexpr int rigid_passes = 32;
 constexpr double rigid_near = 2;  // thicknesses within which the free motion makes pairs active
@@ -82,10 +81,7 @@ class RigidColliders {
   // Cayley's vector of the turn from the start of the step to a pose.
   PD_HD Vec3<double> turn_to(int c, const Pose<double>& pose) const {
     const Pose<double> begin = widened(Hand<T>::read(env_.poses + 7 * c));
-    const Quaternion<double> q =
-        Quaternion<double>{pose.w, pose.axis} * Quaternion<double>{begin.w, -begin.axis};
-    const double w = absolute(q.w), sign = q.w < 0 ? -2.0 : 2.0;
-    return (sign / (w > half_turn ? w : half_turn)) * q.axis;
+    return cayley_vector<double>({begin.w, begin.axis}, {pose.w, pose.axis});
   }
 
   // The quadratics of a collider at a pose, as those of a body's vertices with these derivatives.
