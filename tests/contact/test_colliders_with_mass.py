@@ -13,8 +13,8 @@ from body_scenes import THICKNESS, G, H, crossed, gravity, simulator
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.scene.contact import placed
 from torchpd.ops.fake_kernels import CONTACT_RIGID
+from torchpd.scene.contact import placed
 from torchpd.simulation.state import chosen
 
 Point = tuple[float, float, float]

@@ -408,9 +408,7 @@ torch.library.register_autograd("torchpd::contact_step_vjp", _refuse_second_deri
 for _name in ("free_motion", "motion_after"):
     _vjp = getattr(_ops, f"{_name}_vjp")
     torch.library.register_autograd(f"torchpd::{_name}", _motion_backward(_vjp), setup_context=_save_motion)
-    torch.library.register_autograd(
-        f"torchpd::{_name}_vjp", _refuse_second_derivatives, setup_context=_save_nothing
-    )
+    torch.library.register_autograd(f"torchpd::{_name}_vjp", _refuse_second_derivatives, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::damping_gradient", _damping_backward, setup_context=_save_damping)
 torch.library.register_autograd("torchpd::next_history", _history_backward, setup_context=_save_history)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)

@@ -271,6 +271,4 @@ def _rigid_bodies(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -
     for row, one in zip(rows, plan.rigid, strict=True):
         if one is not None:
             row[:] = [one.mass, *one.center, *np.asarray(one.inertia)[np.triu_indices(3)]]
-    return RigidBodies(
-        torch.tensor(rows[:, :1] > 0.0, device=device), torch.tensor(rows, dtype=dtype, device=device)
-    )
+    return RigidBodies(torch.tensor(rows[:, :1] > 0.0, device=device), torch.tensor(rows, dtype=dtype, device=device))
