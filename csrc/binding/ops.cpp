@@ -57,14 +57,6 @@ struct Cpu {
                            const Tensor&) {
     kernels().contact_step64(call, contact, threads());
   }
-  // the step itself finds its residual
-  static void report_contact(const StepTensors& taken, const Numbers& n, const Tensor& numbers,
-                             const Tensor&) {
-    report_step<Cpu>(taken, n);
-    // environments without contact in this step have the residual of the others
-    const Tensor residual = numbers.select(1, contact_residual);
-    residual.copy_(at::where(residual.isnan(), taken.info.select(1, info_residual), residual));
-  }
   static void field(const FieldCall<float>& call, const Tensor&) {
     kernels().field32(call, threads());
   }

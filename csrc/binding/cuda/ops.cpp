@@ -140,13 +140,6 @@ struct Cuda {
     }
   }
 
-  // The residual of the report, without what forces between bodies [batch, vertices, 3] balance.
-  static void report_contact(const StepTensors& taken, const Numbers& n, const Tensor& numbers,
-                             const Tensor& forces) {
-    report_step<Cuda>(taken, n, &forces);
-    numbers.select(1, contact_residual).copy_(taken.info.select(1, info_residual));
-  }
-
   template <class T>
   static void field(const Field<T>& call, const Tensor& like) {
     // what belongs to effects is zero

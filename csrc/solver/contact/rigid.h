@@ -13,6 +13,7 @@
 // of their corners for given. A pair whose surfaces are near is active where the free motion would bring them too near.
 #pragma once
 #include "solver/contact/environment.h"
+#include "solver/report.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -240,8 +241,31 @@ class RigidColliders {
     if (!group.leads()) return 0.0;
     double sums[S::count] = {};
     for (int n = 0; n < 6; ++n) sums[S::force + n] = wrench[n];
+    const Vec3<double> force{wrench[0], wrench[1], wrench[2]},
+        torque{wrench[3], wrench[4], wrench[5]};
+    const auto square = [&](const Vec3<double>& f, const Vec3<double>& t) {
+      return dot(f, f) + of.length * of.length * dot(t, t);
+    };
+    const double turns = of.length * trace(of.inertia);
+    of.left = square(of.pull + force, of.torque + torque);
+    of.whole = square(of.pull, of.torque) + square(force, torque);
+    of.rounding = of.weight * of.weight * dot(at, at) + turns * turns;
     step(of, sums, 1.0);
     return square_root(dot(of.shift, of.shift) + dot(of.turn, of.turn) / (of.length * of.length));
+  }
+
+  // After that: the share of the forces and torques on all colliders that is not balanced, as solver/report.h has that of
+  // bodies. Torques count by the size.
+  PD_HD double residual() const {
+    double left = 0, whole = 0, rounding = 0;
+    for (int c = 0; exist() && c < plan_.colliders; ++c) {
+      if (!is_rigid(c)) continue;
+      const RigidCollider& of = a_.rigid_collider[c];
+      left += of.left, whole += of.whole, rounding += of.rounding;
+    }
+    const double more =
+        square_root(left) - report_roundings * double(epsilon<T>()) * square_root(rounding);
+    return more > 0 ? more / square_root(left > whole ? left : whole) : 0;
   }
 
   // Colliders stay where they are.
