@@ -49,17 +49,6 @@ PD_HD Vec3<T> rotation_vector(const Quaternion<T>& q) {
   return (sign * (size > T(0) ? angle / size : T(2))) * q.axis;
 }
 
-// Cayley's vector of the smaller turn from one unit quaternion to another: along the axis, 2 tan(angle / 2) long.
-constexpr double half_turn = 1e-9;  // least cosine of half of a turn
-
-template <class R>
-PD_HD Vec3<R> cayley_vector(const Quaternion<R>& start, const Quaternion<R>& end) {
-  const Quaternion<R> q = end * Quaternion<R>{start.w, -start.axis};
-  const bool other = q.w < R(0.0);
-  const R w = other ? -q.w : q.w, sign(other ? -2.0 : 2.0);
-  return (sign / (w > R(half_turn) ? w : R(half_turn))) * q.axis;
-}
-
 // V(phi) u. Below `series_angle` series replace the quotients of differences, which would cancel.
 constexpr double series_angle = 0.1;  // rad
 

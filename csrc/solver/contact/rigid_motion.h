@@ -16,7 +16,7 @@
 #include "contact/motion_views.h"
 #include "math/dual.h"
 #include "math/rotation.h"
-#include "math/screw.h"
+#include "solver/contact/rigid_turn.h"
 
 namespace pd::inline PD_TARGET {
 
@@ -249,17 +249,15 @@ struct MotionAfterStep {
     const Quaternion<R> end = quaternion_of(pose + 3);
     Vec3<R> left = (vector_of(pose) - vector_of(goal)) +
                    (rotated(end, of.center) - rotated(quaternion_of(goal + 3), of.center));
-    const Vec3<R> u = cayley_vector(quaternion_of(before + 3), end),
-                  momentum = vector_of(rates + 3);
+    const Vec3<R> u = turn_between(quaternion_of(before + 3), end), momentum = vector_of(rates + 3);
     const Mat3<R> inertia{
         {{row[4], row[5], row[6]}, {row[5], row[7], row[8]}, {row[6], row[8], row[9]}}};
-    Vec3<R> rest = momentum - h * (inertia * u);
+    Vec3<R> taken = h * torque_after(u, inertia, R(1.0 / time_step) * momentum);
     if (equal(pose, goal, motion_pose)) {  // to the bit where nothing was in the way
       const R none(0.0);
       left = with_derivative(Vec3<R>{none, none, none}, left);
-      rest = with_derivative(Vec3<R>{none, none, none}, rest);
+      taken = with_derivative(Vec3<R>{none, none, none}, taken);
     }
-    const Vec3<R> taken = rest + (R(0.5) * cross(u, rest) + (R(0.25) * dot(u, rest)) * u);
     put(vector_of(rates) + R(1.0 / time_step) * left, out);
     put(solve(of.inertia_at(end), momentum - taken), out + 3);
   }
