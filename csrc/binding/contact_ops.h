@@ -208,7 +208,13 @@ ContactOutputs contact_step(const Numbers& n, const Tensor& positions, const Ten
           ? contact_step_typed<Backend, float>(tensors, poses, history, contact, settings, n.report)
           : contact_step_typed<Backend, double>(tensors, poses, history, contact, settings,
                                                 n.report);
-  if (n.report) Backend::report_contact(tensors, n, std::get<3>(made), std::get<8>(made));
+  if (n.report) {
+    const Tensor &numbers = std::get<3>(made), &pushes = std::get<8>(made);
+    report_step<Backend>(tensors, n, &pushes);
+    // of bodies, or of colliders where it is larger
+    const Tensor residual = numbers.select(1, contact_residual);
+    residual.copy_(at::maximum(residual, info.select(1, info_residual)));
+  }
   return made;
 }
 

@@ -5,6 +5,7 @@
 #include "binding/contact_ops.h"
 #include "binding/history_ops.h"
 #include "binding/plan_views.h"
+#include "binding/rigid_motion_ops.h"
 #include "cpu/dispatch.h"
 
 #include <ATen/Parallel.h>
@@ -55,14 +56,6 @@ struct Cpu {
   static void contact_step(const StepCall<double>& call, const ContactCall<double>& contact,
                            const Tensor&) {
     kernels().contact_step64(call, contact, threads());
-  }
-  // the step itself finds its residual
-  static void report_contact(const StepTensors& taken, const Numbers& n, const Tensor& numbers,
-                             const Tensor&) {
-    report_step<Cpu>(taken, n);
-    // environments without contact in this step have the residual of the others
-    const Tensor residual = numbers.select(1, contact_residual);
-    residual.copy_(at::where(residual.isnan(), taken.info.select(1, info_residual), residual));
   }
   static void field(const FieldCall<float>& call, const Tensor&) {
     kernels().field32(call, threads());
@@ -128,6 +121,16 @@ struct Cpu {
   static void pair_gradients(const PairGradientsCall<double>& call, const Tensor&) {
     kernels().pair_gradients64(call, threads());
   }
+  template <class Motion, class T>
+  static void find_motion(const RigidMotionCall<T>& call, const Tensor&) {
+    each_collider<Motion>(call, [&](std::int64_t row) { pd::find_motion<Motion>(call, row); });
+  }
+  template <class Motion, class T>
+  static void differentiate_motion(const RigidMotionCall<T>& call, const Tensor&) {
+    each_collider<Motion>(call, [&](std::int64_t row) {
+      for (int n = 0; n < Motion::inputs; ++n) pd::differentiate_motion<Motion>(call, row, n);
+    });
+  }
   static void rotation(const RotationCall<float>& call, const Tensor&) {
     kernels().rotation32(call, threads());
   }
@@ -149,6 +152,16 @@ struct Cpu {
   static bool recording(const Tensor&) { return false; }
 
   static int threads() { return at::get_num_threads(); }
+
+ private:
+  template <class Motion, class T, class Visit>
+  static void each_collider(const RigidMotionCall<T>& call, const Visit& visit) {
+    constexpr std::int64_t grain = 64;  // microseconds each
+    at::parallel_for(0, call.batch * call.colliders, grain,
+                     [&](std::int64_t begin, std::int64_t end) {
+                       for (std::int64_t row = begin; row < end; ++row) visit(row);
+                     });
+  }
 };
 
 }  // namespace
@@ -266,6 +279,19 @@ TORCH_LIBRARY(torchpd, m) {
       "progress, Tensor positions, Tensor inertia, Tensor inverse, Tensor? projector, Tensor[] "
       "material, Tensor[] plan, Tensor? start=None, *, float tolerance, int iterations, float "
       "time_step=0.0) -> ()");
+  m.def(
+      "free_motion(Tensor poses, Tensor motion, Tensor? wrenches, Tensor gravity, Tensor bodies, "
+      "*, float time_step) -> (Tensor, Tensor, Tensor)");
+  m.def(
+      "free_motion_vjp(Tensor grad_poses, Tensor grad_rates, Tensor grad_rows, Tensor poses, "
+      "Tensor motion, Tensor? wrenches, Tensor gravity, Tensor bodies, *, float time_step) -> "
+      "Tensor");
+  m.def(
+      "motion_after(Tensor before, Tensor goal, Tensor rates, Tensor rows, Tensor poses, Tensor "
+      "bodies, *, float time_step) -> Tensor");
+  m.def(
+      "motion_after_vjp(Tensor grad, Tensor before, Tensor goal, Tensor rates, Tensor rows, Tensor "
+      "poses, Tensor bodies, *, float time_step) -> Tensor");
   m.def("nearest_rotation(Tensor matrices) -> Tensor");
   m.def("rotation_differential(Tensor matrices, Tensor direction) -> Tensor");
 }
@@ -276,6 +302,7 @@ TORCH_LIBRARY_IMPL(torchpd, CPU, m) {
   register_history_ops<Cpu>(m);
   register_contact_ops<Cpu>(m);
   register_contact_adjoint<Cpu>(m);
+  register_rigid_motion<Cpu>(m);
 }
 
 }  // namespace pd

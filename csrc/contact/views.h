@@ -49,8 +49,10 @@ enum ContactInfo : int {
   contact_gap,             // least d / r, inf without pairs
   contact_overflow,        // pairs that the capacity lacks
   contact_pins_held_back,  // m
-  contact_residual,        // share of the forces that is not balanced; NaN unless requested
-  contact_pairs,           // most pairs in a list
+  // share of the forces that is not balanced, of colliders with a mass, and from the op the larger of it and that of bodies;
+  // NaN unless requested
+  contact_residual,
+  contact_pairs,  // most pairs in a list
   contact_searches,
   contact_shortened,  // vertices whose way was cut, summed over iterations
   contact_frozen,     // vertices that no plane let move, summed over iterations

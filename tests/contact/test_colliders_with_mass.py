@@ -13,8 +13,8 @@ from body_scenes import THICKNESS, G, H, crossed, gravity, simulator
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.common.rigid_motion import _rotation
 from torchpd.ops.fake_kernels import CONTACT_RIGID
+from torchpd.scene.contact import placed
 from torchpd.simulation.state import chosen
 
 Point = tuple[float, float, float]
@@ -55,7 +55,9 @@ def with_motion(state: pd.HistoryState, collider: int, *motion: float) -> pd.His
 
 def angular_momentum(collider: pd.Collider, state: pd.HistoryState, number: int) -> Tensor:
     """About its centre of mass [3]."""
-    turn = _rotation(state.history.poses[0, number, 3:])  # type: ignore[union-attr]
+    pose = state.history.poses[0, number].clone()  # type: ignore[union-attr]
+    pose[:3] = 0.0
+    turn = torch.tensor(placed(pose[None].numpy(), np.eye(3))).T
     inertia = turn @ torch.tensor(collider.inertia) @ turn.T
     return inertia @ state.history.motion[0, number, 3:]  # type: ignore[union-attr]
 
@@ -185,6 +187,42 @@ def test_held_back_says_what_forces_do_not_account_for(
         assert held <= 1.0001 * math.hypot(shift, turn / least) + 1e-14
 
 
+@pytest.mark.parametrize("iterations", [1, 4, 16])
+@pytest.mark.parametrize("spin", [0.0, 5.0])
+def test_the_residual_is_that_of_colliders_where_it_is_larger(iterations: int, spin: float) -> None:
+    """The body falls freely, so that its own is rounding. |r| / max(|r|, |forces|), with torques by the size."""
+    sim, plate, state = sliding(6, 0.013, iterations)
+    state = with_motion(state, 1, 2.0, 0, 0, 0, spin, 0)
+    size = math.sqrt(0.5 * float(np.trace(plate.inertia)) / plate.mass)
+    most = 0.0
+    for _ in range(6):
+        before, (state, info) = state, sim(state, return_info=True)
+        wrench = sim.contact_forces(before, state).on_colliders[0, 1]
+        change = (state.history.motion - before.history.motion)[0, 1, :3]
+        spins = angular_momentum(plate, state, 1) - angular_momentum(plate, before, 1)
+        inertia = torch.cat([plate.mass * (change / H + torch.tensor([0.0, 10.0, 0.0])), spins / H / size])
+        forces = torch.cat([wrench[:3], wrench[3:] / size])
+        left = float((inertia - forces).norm())
+        share = left / max(left, math.hypot(float(inertia.norm()), float(forces.norm())))
+        assert float(info.residual) == pytest.approx(share, rel=1e-6, abs=1e-11)
+        most = max(most, share)
+    assert (most > 1e-3) == (iterations < 16)
+
+
+def test_the_residual_of_free_colliders_is_zero(dtype: torch.dtype) -> None:
+    """Also while others meet: rounding is no force. So a body in contact has its own."""
+    cube, block, table_ = soft(0.0, 0.05, 0.0), rigid(1.0, 0.4, 0.5, 0.0, turn=(0.6, 0.0, 0.8, 0.0)), table()
+    still, pushed = (
+        simulator(pd.Scene(cube, table_, *more, contact(), gravity()), 16, dtype=dtype) for more in ((), (block,))
+    )
+    state, other = still.rest_state(), with_motion(pushed.rest_state(), 1, 0, 0, 0, 3, 2, 1)
+    for _ in range(5):
+        state, info = still(state, return_info=True)
+        other, same = pushed(other, return_info=True)
+        assert 0.0 < float(info.residual) < 1.0
+        assert float(same.residual) == float(info.residual)
+
+
 def test_a_tolerance_waits_for_colliders() -> None:
     """The body falls freely, so that its own iterations are done at once."""
     sim, _, state = sliding(6, 0.013, 256, tolerance=1e-9)
@@ -296,6 +334,14 @@ def test_a_scene_without_masses_has_nothing_of_them() -> None:
     assert sim.body_contact.rigid is None
     assert sim.body_contact.arrays[CONTACT_RIGID].numel() == 0
     assert sim.rest_state(3).history.motion.shape == (3, 0, 6)
+
+
+@pytest.mark.parametrize("wall", [pd.Ground(), pd.Sphere((0.0, -1.0, 0.0), 0.5)], ids=["Ground", "Sphere"])
+def test_planes_and_spheres_pass_through_them_with_a_warning(wall: pd.Ground | pd.Sphere) -> None:
+    ball = rigid(0.3, 0.5, 0.0, 0.0)
+    name = f"{type(wall).__name__} and 1 Collider with a mass"
+    with pytest.warns(pd.SceneWarning, match=name):
+        simulator(pd.Scene(soft(0.0, 0.5, 0.0), ball, wall, contact()), 4)
 
 
 def test_gradients_are_refused_by_name() -> None:

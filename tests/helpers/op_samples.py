@@ -85,8 +85,36 @@ def samples_of_the_adjoint(sim: pd.Simulator, x: Tensor) -> dict[str, tuple[tupl
             (f, errors, direction, material, f, direction, projector, x[..., 0] > 0.1, sliding), h,
         ),
         **samples_of_contact(x),
+        **samples_of_rigid_motion(x),
         "adjoint_fallback": ((direction, errors, 0 * errors, still, f, 1 / inertia, None, material, plan), h),
     }  # fmt: skip
+
+
+def rigid_bodies(batch: int, like: Tensor) -> tuple[Tensor, ...]:
+    """Poses, velocities and wrenches [batch, 2, n], gravity [3] and constant numbers [2, 10] of two colliders."""
+    rates = noise(like.new_empty(batch, 2, 12))
+    poses = torch.cat([0.1 * rates[..., :3], torch.nn.functional.normalize(rates[..., 3:7], dim=-1)], dim=-1)
+    moments = [0.01, 0.001, -0.002, 0.015, 0.003, 0.012], [1e-3, 0, 0, 2e-3, 0, 2.5e-3]
+    bodies = like.new_tensor([[0.5, 0.1, 0.2, 0.3, *moments[0]], [0.02, 0, 0, 0.01, *moments[1]]])
+    gravity = like.new_tensor([0.0, -10.0, 1.0])
+    return poses, noise(rates[..., :6], 1) * 10.0, 0.1 * noise(rates[..., :6], 2), gravity, bodies
+
+
+def samples_of_rigid_motion(x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
+    """Arguments of the ops of colliders with a mass."""
+    given, h = rigid_bodies(BATCH, x.detach()), {"time_step": 1 / 60}
+    goal, rates, rows = torch.ops.torchpd.free_motion(*given, **h)
+    after = given[0], goal, rates, rows, given[0], given[-1]
+
+    def wanted(arrays: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+        return tuple(array.detach().clone().requires_grad_() for array in arrays)
+
+    return {
+        "free_motion": (wanted(given), h),
+        "free_motion_vjp": ((noise(goal), noise(rates), noise(rows), *given), h),
+        "motion_after": (wanted(after), h),
+        "motion_after_vjp": ((noise(rates), *after), h),
+    }
 
 
 def samples_of_contact(x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, Any]]]:
@@ -129,4 +157,5 @@ OPS = (
     "step", "step_", "rollout", "gradient", "element_energy", "element_energy_product", "hessian_product",
     "elastic_diagonal", "nearest_rotation", "rotation_differential", "step_vjp", "rollout_vjp", "conjugate_gradients_",
     "adjoint_system", "contact_gradients", "adjoint_result", "adjoint_fallback", "conjugate_gradients",
+    "free_motion", "free_motion_vjp", "motion_after", "motion_after_vjp",
 )  # fmt: skip

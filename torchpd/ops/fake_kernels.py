@@ -111,6 +111,26 @@ def _(
     return [*state, *moved, *own, *(array.new_empty(array.shape) for array, one in asked if one)]
 
 
+@_register_fake("free_motion")
+def _(poses: Tensor, *_: Any, **__: Any) -> tuple[Tensor, Tensor, Tensor]:
+    return poses.new_empty(poses.shape), poses.new_empty((*poses.shape[:2], 6)), poses.new_empty((*poses.shape[:2], 13))
+
+
+@_register_fake("motion_after")
+def _(before: Tensor, *_: Any, **__: Any) -> Tensor:
+    return before.new_empty((*before.shape[:2], 6))
+
+
+@_register_fake("free_motion_vjp")
+def _(grad_poses: Tensor, *_: Any, **__: Any) -> Tensor:
+    return grad_poses.new_empty((*grad_poses.shape[:2], 32))
+
+
+@_register_fake("motion_after_vjp")
+def _(grad: Tensor, *_: Any, **__: Any) -> Tensor:
+    return grad.new_empty((*grad.shape[:2], 50))
+
+
 @_register_fake("gradient")
 def _(positions: Tensor, material: Sequence[Tensor], plan: Sequence[Tensor]) -> Tensor:
     return positions.new_empty(positions.shape)

@@ -20,6 +20,7 @@ __all__ = ["INFO_WIDTH", "nearest_rotation", "refuse_forward_mode"]
 
 _ops = torch.ops.torchpd
 _POISSON = [row.name for row in MATERIAL_TABLE].index("poisson")
+_WRENCH = 6  # numbers of a wrench, csrc/contact/motion_views.h
 _STENCIL_PLAN = len(PLAN_TABLE) + len(STENCIL_TABLE)
 
 
@@ -369,6 +370,26 @@ def _contact_backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
     )
 
 
+def _save_motion(ctx: Any, inputs: tuple[Any, ...], keyword_only_inputs: dict[str, Any], output: Any) -> None:
+    ctx.time_step = keyword_only_inputs["time_step"]
+    ctx.save_for_backward(*inputs)
+
+
+def _motion_backward(vjp: Any) -> Any:
+    """Backward pass of an op of colliders with a mass, whose arrays expand to [batch, colliders, numbers]."""
+
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        inputs = ctx.saved_tensors
+        # arrays that were left out have their place in the row
+        widths = [_WRENCH if array is None else array.shape[-1] for array in inputs]
+        rows = vjp(*grads, *inputs, time_step=ctx.time_step).split(widths, dim=-1)
+        return tuple(
+            None if array is None else row.sum_to_size(array.shape) for array, row in zip(inputs, rows, strict=True)
+        )
+
+    return backward
+
+
 def _refuse_second_derivatives(ctx: Any, *_: Any) -> Any:
     raise RuntimeError(
         "torchpd: a step has first derivatives only; differentiate without create_graph, or take differences of the "
@@ -384,6 +405,10 @@ register_rule("rollout_vjp", rollout_vjp_rule)
 torch.library.register_autograd("torchpd::elastic_diagonal", _diagonal_backward, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::contact_step", _contact_backward, setup_context=_save_contact)
 torch.library.register_autograd("torchpd::contact_step_vjp", _refuse_second_derivatives, setup_context=_save_nothing)
+for _name in ("free_motion", "motion_after"):
+    _vjp = getattr(_ops, f"{_name}_vjp")
+    torch.library.register_autograd(f"torchpd::{_name}", _motion_backward(_vjp), setup_context=_save_motion)
+    torch.library.register_autograd(f"torchpd::{_name}_vjp", _refuse_second_derivatives, setup_context=_save_nothing)
 torch.library.register_autograd("torchpd::damping_gradient", _damping_backward, setup_context=_save_damping)
 torch.library.register_autograd("torchpd::next_history", _history_backward, setup_context=_save_history)
 torch.library.register_autograd("torchpd::precondition", _precondition_backward, setup_context=_precondition_setup)

@@ -185,6 +185,31 @@ def _rotation_rule(name: str) -> Rule:
     return rule
 
 
+def _motion_rule(name: str) -> Rule:
+    """Rule for an op whose arrays expand to [batch, colliders, numbers]."""
+    op = getattr(_ops, name)
+
+    def rule(info: Any, in_dims: Any, *arrays: Tensor | None, **numbers: Any) -> tuple[Any, int]:
+        pairs = list(zip(arrays, in_dims, strict=True))
+        shapes = [_shape_of_one(t, d) for t, d in pairs if t is not None]
+        batch, colliders = torch.broadcast_shapes(*(shape[:-1] for shape in shapes if len(shape) == 3))
+        maps = info.batch_size, batch
+
+        def joined(tensor: Tensor | None, dim: int | None) -> Tensor | None:
+            if tensor is None:
+                return None
+            front = tensor.unsqueeze(0) if dim is None else tensor.movedim(dim, 0)
+            wide = front.reshape(len(front), *[1] * (4 - front.dim()), *front.shape[1:])
+            return wide.expand(*maps, colliders, -1).flatten(0, 1)
+
+        _check_one(all(0 < len(shape) < 4 for shape in shapes), op, in_dims, arrays, **numbers)
+        return pytree.tree_map(lambda t: t.unflatten(0, maps), op(*(joined(t, d) for t, d in pairs), **numbers)), 0
+
+    return rule
+
+
+for _name in ("free_motion", "free_motion_vjp", "motion_after", "motion_after_vjp"):
+    register_rule(_name, _motion_rule(_name))
 for _name in ("gradient", "hessian_product", "effect_energy"):
     register_rule(_name, _batch_rule(_name, read=_ELASTIC))
 register_rule("damping_gradient", _batch_rule("damping_gradient", read=_ELASTIC))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..common.checks import check_scalar
-from ..common.rigid_motion import RigidBodies, refuse_gradients
+from ..common.rigid_motion import refuse_gradients
 from ..ops.diagonal import named_material
 from ..ops.fake_kernels import CONTACT_FRICTION, CONTACT_RIGID, CONTACT_THICKNESS
 from ..plan.contact_clusters import contact_clusters
@@ -19,7 +18,6 @@ from ..plan.contact_plan import ContactPlan, contact_plan
 from ..plan.contact_start import check_start
 from ..plan.contact_tree import FAN_OUT
 from ..scene.contact import placed
-from ..scene.rigid import RigidMass
 from ..scene.scene import SceneValues
 from ..scene.targets import ColliderInputs
 from .pair_forces import ContactSurfaces
@@ -32,6 +30,14 @@ _MISSING, _PINS_HELD_BACK, _UNBALANCED = 1, 2, 3  # columns in csrc/contact/view
 _RESIDUAL = 0  # column of the rows of a step
 _CAPACITY = 2  # place among the sizes of the op
 _RIGID_NUMBERS = 13  # rigid_numbers in csrc/contact/views.h: filled in by steps, of scenes with such colliders alone
+
+
+class RigidBodies(NamedTuple):
+    """Colliders with a mass, among all; csrc/solver/contact/rigid_motion.h says how they move."""
+
+    is_rigid: Tensor  # [C, 1] bool
+    # [C, 10] mass [kg], 0 for others, centre of mass [m] and moment of inertia about it [kg m^2], xx xy xz yy yz zz
+    numbers: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,22 +174,25 @@ class BodyContact:
         arrays, motion, rigid = self.arrays, before.motion, self.rigid
         if rigid is not None:
             gravity = named_material(material)["gravity"]
-            free = rigid.free_motion(history[0], motion, inputs.wrenches, gravity, time_step)
-            wanted = torch.where(rigid.is_rigid, free.poses, wanted)
+            goal, rates, masses = _ops.free_motion(
+                history[0], motion, inputs.wrenches, gravity.unsqueeze(-2), rigid.numbers, time_step=time_step
+            )
+            wanted = torch.where(rigid.is_rigid, goal, wanted)
             arrays = list(arrays)
-            arrays[CONTACT_RIGID] = rigid.rows(free, time_step)
+            arrays[CONTACT_RIGID] = masses.flatten(0, 1)
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
             state[0], state[1], forces, wanted, history, material, plan, arrays, **settings
         )
         missing = (numbers[:, _MISSING] > 0)[:, None, None]
         if rigid is not None:
-            motion = torch.where(missing, motion, rigid.motion_after(free, history[0], actual, time_step))
+            after = _ops.motion_after(history[0], goal, rates, masses, actual, rigid.numbers, time_step=time_step)
+            motion = torch.where(missing, motion, after)
             positions, velocities, actual, motion = refuse_gradients(positions, velocities, actual, motion)
         flow = before.flow
         if flow.shape[-2]:
-            (after,) = _ops.next_history(positions, material, plan, time_step=time_step)
+            (flowed,) = _ops.next_history(positions, material, plan, time_step=time_step)
             # the step of an environment whose pairs exceed the capacity is taken back
-            flow = torch.where(missing, flow, after)
+            flow = torch.where(missing, flow, flowed)
         held_back = numbers[:, _PINS_HELD_BACK:_UNBALANCED]
         if held.shape[1]:
             held_back = torch.cat([held_back, held.double()], dim=1).amax(dim=1, keepdim=True)
@@ -258,14 +267,8 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
 def _rigid_bodies(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> RigidBodies | None:
     if not any(plan.rigid):
         return None
-
-    def stacked(of: Callable[[RigidMass], Any], otherwise: Any) -> Tensor:
-        values = np.array([otherwise if one is None else of(one) for one in plan.rigid])
-        return torch.tensor(values, dtype=dtype, device=device)
-
-    return RigidBodies(
-        torch.tensor([[one is not None] for one in plan.rigid], device=device),
-        stacked(lambda of: [of.mass], [1.0]),
-        stacked(lambda of: of.center, np.zeros(3)),
-        stacked(lambda of: of.inertia, np.eye(3)),
-    )
+    rows = np.zeros((len(plan.rigid), 10))
+    for row, one in zip(rows, plan.rigid, strict=True):
+        if one is not None:
+            row[:] = [one.mass, *one.center, *np.asarray(one.inertia)[np.triu_indices(3)]]
+    return RigidBodies(torch.tensor(rows[:, :1] > 0.0, device=device), torch.tensor(rows, dtype=dtype, device=device))

@@ -31,8 +31,9 @@ _INVERTED, _MISSING = 6, 8  # columns of the rows of a report
 
 
 def warn_of_scene(scene: Scene) -> None:
-    """Warn of bodies that overlap at rest, and of spheres that fit through the meshes of bodies."""
+    """Warn of bodies that overlap at rest, and of planes and spheres that do not meet what looks as if they did."""
     _say_small_spheres(scene)
+    _say_rigid(scene)
     if len(scene.solids) > 1 and _may_pass(scene):
         _say_overlaps(scene, find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
 
@@ -53,6 +54,19 @@ def _say_small_spheres(scene: Scene) -> None:
             f"Simulator: a sphere of radius {radius:.3g} m may meet edges of {_kinds(met)} of up to {longest:.3g} m. "
             "Only their vertices collide with a Sphere, which passes through such edges: refine the mesh until edges "
             f"are shorter than the radius, or take Collider(torchpd.shapes.sphere({radius:.3g})) in a Contact",
+            SceneWarning,
+        )
+
+
+def _say_rigid(scene: Scene) -> None:
+    """Planes and spheres of the scene act on vertices of bodies, which colliders are not."""
+    rigid = sum(collider.mass is not None for collider in scene.colliders)
+    walls = [*scene.grounds, *scene.spheres]
+    if rigid and walls:
+        names = " and ".join(dict.fromkeys(type(wall).__name__ for wall in walls))
+        warn_user(
+            f"Simulator: {names} and {rigid} Collider with a mass are in one scene, and pass through each other, since "
+            "planes and spheres act on vertices of bodies alone. Take a Collider without a mass as the table",
             SceneWarning,
         )
 

@@ -264,8 +264,10 @@ class Info(NamedTuple):
     The residual is (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). Here r is the part of grad E [N] that
     neither pins nor contacts balance. f_i = a_i (u_i - s_i) is the force of inertia, weight and springs on vertex i,
     and e_i that of its elements. S x is the sum of stiffness times position (csrc/solver/report.h), so 4 eps |S x|
-    bounds the rounding that no iteration removes. With `Contact` it is not subtracted, and r is also without the forces
-    between bodies.
+    bounds the rounding that no iteration removes. With `Contact` r is also without the forces between bodies. Colliders
+    with a mass have a share of their own, and the larger one is the residual. There r is the force and the torque that
+    are not balanced, and the others are those of inertia and of contact. A torque counts by the size s, where m s^2 is
+    half of the trace of the moment of inertia.
 
     If all forces are below that bound, the residual is 0 and says nothing: see docs/limits.md and use float64 there.
     The residual weighs short waves, so the error of positions may be larger or smaller. It ignores a contact that

@@ -4,7 +4,9 @@
 #include "binding/contact_adjoint_ops.h"
 #include "binding/contact_ops.h"
 #include "binding/plan_views.h"
+#include "binding/rigid_motion_ops.h"
 #include "cuda/common/launch.h"
+#include "cuda/contact/rigid_motion.h"
 #include "cuda/poisson/launch.h"
 
 #include <c10/cuda/CUDAGraphsC10Utils.h>
@@ -138,13 +140,6 @@ struct Cuda {
     }
   }
 
-  // The residual of the report, without what forces between bodies [batch, vertices, 3] balance.
-  static void report_contact(const StepTensors& taken, const Numbers& n, const Tensor& numbers,
-                             const Tensor& forces) {
-    report_step<Cuda>(taken, n, &forces);
-    numbers.select(1, contact_residual).copy_(taken.info.select(1, info_residual));
-  }
-
   template <class T>
   static void field(const Field<T>& call, const Tensor& like) {
     // what belongs to effects is zero
@@ -231,6 +226,17 @@ struct Cuda {
     run_vertex_sum(call, c10::cuda::getCurrentCUDAStream().stream());
   }
 
+  template <class Motion, class T>
+  static void find_motion(const RigidMotionCall<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_find_motion<Motion>(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+  template <class Motion, class T>
+  static void differentiate_motion(const RigidMotionCall<T>& call, const Tensor& like) {
+    const c10::cuda::CUDAGuard guard(like.device());
+    run_differentiate_motion<Motion>(call, c10::cuda::getCurrentCUDAStream().stream());
+  }
+
   static bool recording(const Tensor& like) {
     const c10::cuda::CUDAGuard guard(like.device());
     return c10::cuda::currentStreamCaptureStatusMayInitCtx() != c10::cuda::CaptureStatus::None;
@@ -260,6 +266,7 @@ TORCH_LIBRARY_IMPL(torchpd, CUDA, m) {
   register_adjoint_ops<Cuda>(m);
   register_contact_ops<Cuda>(m);
   register_contact_adjoint<Cuda>(m);
+  register_rigid_motion<Cuda>(m);
 }
 
 }  // namespace pd

@@ -119,7 +119,6 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
 
   void finish() {
     steps_.finish(alone_, forces());
-    residual_ = contact_.report ? residual() : double(NAN);
     Base::finish();
   }
 
@@ -157,34 +156,10 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
 
   T* forces() const { return contact_.forces + 3 * e_ * contact_.plan.vertices; }
 
-  // |r| / max(|r|, |f|): of r, the part of the gradient that neither pairs nor planes, spheres and pins balance, and of f,
-  // the forces of inertia and of elements on every vertex.
-  double residual() {
-    double left = 0, whole = 0;
-    const auto gradient = elastic_gradient<false>();
-    sweep_.run(0, gradient, [&](std::int64_t i, const Value& force, Sum&) {
-      const auto v = vertex(i);
-      if (!(v.inverse > T(0))) return;
-      const T* const of = forces() + 3 * std::int64_t(plan_.vertex_order[i]);
-      const Value push = Lanes::value({of[0], of[1], of[2]});
-      const Value inertia = v.inertia * (w_.u[i] - v.target);
-      left += square(v.residual(contacts_, w_.u[i], force - push));
-      whole += square(inertia) + square(force);
-    });
-    const double most = left > whole ? left : whole;
-    return most > 0 ? std::sqrt(left / most) : 0;
-  }
-
-  static double square(const Value& a) {
-    const Vec3<T> b = Lanes::vec3(a);
-    return double(dot(b, b));
-  }
-
   // Poses, forces and numbers of the contact, for the caller. An overflow takes the step back.
   void write() {
     const ContactOutput<T> to = contact_output(contact_, e_);
     steps_.write(alone_, to);
-    to.info[contact_residual] = residual_;
     if (!steps_.overflows()) return;
     const std::int64_t count = 3 * std::int64_t(plan_.vertices);
     std::copy_n(call_.positions + e_ * count, count, call_.out_positions + e_ * count);
@@ -197,7 +172,6 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
   ContactEnvironment<T> env_;
   ContactSteps<T, true> steps_;
   SerialTeam alone_;
-  double residual_ = NAN;
   bool begun_ = false;
 };
 

@@ -126,6 +126,8 @@ struct RigidCollider {
   double length;
   Vec3<double> pull, torque, shift, turn;
   double energy;
+  // at the end of a step: squares of what is not balanced, of all, and of places and turns in N [N^2]
+  double left, whole, rounding;
 };
 
 // Arrays of an environment. Vertices have the user's numbers, those of colliders last.
@@ -311,6 +313,7 @@ struct ContactOutput {
   std::int64_t* keys;
   T *forces, *held_back, *vertex_forces;
   double* info;
+  bool report;
 
   PD_HD void write_force(int at, std::int64_t key, const Multiplier<T>& of) const {
     keys[at] = key;
@@ -329,7 +332,8 @@ PD_HD ContactOutput<T> contact_output(const ContactCall<T>& contact, std::int64_
           history.next_forces + 4 * m,
           contact.held_back + c,
           contact.forces + 3 * e * plan.vertices,
-          contact.info + e * contact_info_count};
+          contact.info + e * contact_info_count,
+          contact.report};
 }
 
 // What a team works on.

@@ -58,7 +58,7 @@ class FreeMotion {
     team.once([&] {
       for (int n = 0; n < contact_info_count; ++n) to.info[n] = 0;
       to.info[contact_gap] = HUGE_VAL;
-      to.info[contact_residual] = NAN;
+      if (!to.report) to.info[contact_residual] = NAN;
     });
   }
 

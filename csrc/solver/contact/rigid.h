@@ -13,12 +13,11 @@
 // of their corners for given. A pair whose surfaces are near is active where the free motion would bring them too near.
 #pragma once
 #include "solver/contact/environment.h"
+#include "solver/contact/rigid_turn.h"
+#include "solver/report.h"
 
 namespace pd::inline PD_TARGET {
 
-// Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
-constexpr double rigid_yield = 1e-3;
-constexpr double half_turn = 1e-9;  // least cosine of half of a turn
 // Newton's steps of a sweep: most take two. Four of eight are halves, as some cycle.
 constexpr int rigid_passes = 32;
 constexpr double rigid_near = 2;  // thicknesses within which the free motion makes pairs active
@@ -84,19 +83,14 @@ class RigidColliders {
   // Cayley's vector of the turn from the start of the step to a pose.
   PD_HD Vec3<double> turn_to(int c, const Pose<double>& pose) const {
     const Pose<double> begin = widened(Hand<T>::read(env_.poses + 7 * c));
-    const Quaternion<double> q =
-        Quaternion<double>{pose.w, pose.axis} * Quaternion<double>{begin.w, -begin.axis};
-    const double w = absolute(q.w), sign = q.w < 0 ? -2.0 : 2.0;
-    return (sign / (w > half_turn ? w : half_turn)) * q.axis;
+    return turn_between<double>({begin.w, begin.axis}, {pose.w, pose.axis});
   }
 
   // The quadratics of a collider at a pose, as those of a body's vertices with these derivatives.
   PD_HD RigidBody body_at(int c, const Pose<T>& pose) const {
     const RigidCollider& of = a_.rigid_collider[c];
     const Pose<double> at = widened(pose);
-    const Vec3<double> turn = turn_to(c, at), left = of.momentum - of.inertia * turn,
-                       torque = multiply_add(0.25 * dot(turn, left), turn,
-                                             multiply_add(0.5, cross(turn, left), left));
+    const Vec3<double> torque = torque_after(turn_to(c, at), of.inertia, of.momentum);
     const double half = 0.5 * trace(of.inertia);
     const Mat3<double> whole{{{half, 0, 0}, {0, half, 0}, {0, 0, half}}},
         twist = cross_matrix(0.5 * torque);
@@ -246,8 +240,31 @@ class RigidColliders {
     if (!group.leads()) return 0.0;
     double sums[S::count] = {};
     for (int n = 0; n < 6; ++n) sums[S::force + n] = wrench[n];
+    const Vec3<double> force{wrench[0], wrench[1], wrench[2]},
+        torque{wrench[3], wrench[4], wrench[5]};
+    const auto square = [&](const Vec3<double>& f, const Vec3<double>& t) {
+      return dot(f, f) + of.length * of.length * dot(t, t);
+    };
+    const double turns = of.length * trace(of.inertia);
+    of.left = square(of.pull + force, of.torque + torque);
+    of.whole = square(of.pull, of.torque) + square(force, torque);
+    of.rounding = of.weight * of.weight * dot(at, at) + turns * turns;
     step(of, sums, 1.0);
     return square_root(dot(of.shift, of.shift) + dot(of.turn, of.turn) / (of.length * of.length));
+  }
+
+  // After that: the share of the forces and torques on all colliders that is not balanced, as solver/report.h has that of
+  // bodies. Torques count by the size.
+  PD_HD double residual() const {
+    double left = 0, whole = 0, rounding = 0;
+    for (int c = 0; exist() && c < plan_.colliders; ++c) {
+      if (!is_rigid(c)) continue;
+      const RigidCollider& of = a_.rigid_collider[c];
+      left += of.left, whole += of.whole, rounding += of.rounding;
+    }
+    const double more =
+        square_root(left) - report_roundings * double(epsilon<T>()) * square_root(rounding);
+    return more > 0 ? more / square_root(left > whole ? left : whole) : 0;
   }
 
   // Colliders stay where they are.

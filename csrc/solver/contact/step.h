@@ -284,7 +284,7 @@ class ContactSteps {
       to.info[contact_shortened] = numbers.shortened;
       to.info[contact_frozen] = numbers.frozen;
       to.info[contact_pins_held_back] = double(a_.most[plan_.colliders]);
-      to.info[contact_residual] = NAN;
+      to.info[contact_residual] = to.report ? rigid_.residual() : NAN;
     });
   }
 
