@@ -15,14 +15,14 @@ All is made of sums, products, quotients and roots: others have other bits in ve
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from .small_matrices import dot, inverse, length, product
 
-__all__ = ["FreeMotion", "RigidBodies", "refuse_gradients"]
+__all__ = ["FreeMotion", "RigidBodies"]
 
 _MIDPOINT_ROUNDS = 12  # each takes off a factor of about half of the turn
 _MIDDLE = 1.0  # most |u| of which the middle is taken
@@ -93,27 +93,6 @@ class RigidBodies(NamedTuple):
     def _at(self, turn: Tensor) -> Tensor:
         """Moments of inertia in world axes."""
         return product(product(turn, self.inertia.expand_as(turn)), turn.mT)
-
-
-class _Refused(torch.autograd.Function):
-    """Passes tensors on, and refuses their gradients."""
-
-    @staticmethod
-    def forward(ctx: Any, *tensors: Tensor) -> tuple[Tensor, ...]:
-        return tuple(tensor.view_as(tensor) for tensor in tensors)
-
-    @staticmethod
-    def backward(ctx: Any, *_: Any) -> Any:
-        raise RuntimeError(
-            "gradients of a step must not be asked where a Collider has a mass, got backward() through one; give the "
-            "Collider mass=None and its pose as a target, or detach() the state (docs/limits.md)"
-        )
-
-
-def refuse_gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
-    """The same tensors, whose backward pass raises."""
-    found: tuple[Tensor, ...] = _Refused.apply(*tensors)  # type: ignore[no-untyped-call]
-    return found
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..common.checks import check_scalar
-from ..common.rigid_motion import RigidBodies, refuse_gradients
+from ..common.rigid_motion import RigidBodies
 from ..ops.diagonal import named_material
 from ..ops.fake_kernels import CONTACT_FRICTION, CONTACT_RIGID, CONTACT_THICKNESS
 from ..plan.contact_clusters import contact_clusters
@@ -178,7 +178,6 @@ class BodyContact:
         missing = (numbers[:, _MISSING] > 0)[:, None, None]
         if rigid is not None:
             motion = torch.where(missing, motion, rigid.motion_after(free, history[0], actual, time_step))
-            positions, velocities, actual, motion = refuse_gradients(positions, velocities, actual, motion)
         flow = before.flow
         if flow.shape[-2]:
             (after,) = _ops.next_history(positions, material, plan, time_step=time_step)

@@ -246,6 +246,7 @@ struct PairSlopes {
   T load[12][12];   // of -w (x) f, by the corners at the end
   T row[3][12];     // of the gap and of the slips, by these: C
   T column[3][12];  // of w (x) f by the multipliers: B
+  Vec3<T> force;    // f
   // of a pair that slides, else 0: mu lambda / |s| [N/m], by which its slip turns across
   T stiffness;
   Vec3<T> across;
@@ -263,6 +264,7 @@ struct PairSlopes {
         column[k][3 * a] = of.x, column[k][3 * a + 1] = of.y, column[k][3 * a + 2] = of.z;
       }
     }
+    force = terms.force;
     const Vec3<T> slip = pair_slip(terms.frame, end, start);
     const T length = square_root(dot(slip, slip));
     stiffness = slides ? pair.friction * lambda / length : T(0);

@@ -13,12 +13,10 @@
 // of their corners for given. A pair whose surfaces are near is active where the free motion would bring them too near.
 #pragma once
 #include "solver/contact/environment.h"
+#include "solver/contact/rigid_turn.h"
 
 namespace pd::inline PD_TARGET {
 
-// Of the compliance 1 / W: that of the vertices of a collider, which bounds beta where nothing else yields.
-constexpr double rigid_yield = 1e-3;
-constexpr double half_turn = 1e-9;  // least cosine of half of a turn
 // Newton's steps of a sweep: most take two. Four of eight are halves, as some cycle.
 constexpr int rigid_passes = 32;
 constexpr double rigid_near = 2;  // thicknesses within which the free motion makes pairs active
@@ -82,19 +80,14 @@ class RigidColliders {
   // Cayley's vector of the turn from the start of the step to a pose.
   PD_HD Vec3<double> turn_to(int c, const Pose<double>& pose) const {
     const Pose<double> begin = widened(Hand<T>::read(env_.poses + 7 * c));
-    const Quaternion<double> q =
-        Quaternion<double>{pose.w, pose.axis} * Quaternion<double>{begin.w, -begin.axis};
-    const double w = absolute(q.w), sign = q.w < 0 ? -2.0 : 2.0;
-    return (sign / (w > half_turn ? w : half_turn)) * q.axis;
+    return turn_between<double>({begin.w, begin.axis}, {pose.w, pose.axis});
   }
 
   // The quadratics of a collider at a pose, as those of a body's vertices with these derivatives.
   PD_HD RigidBody body_at(int c, const Pose<T>& pose) const {
     const RigidCollider& of = a_.rigid_collider[c];
     const Pose<double> at = widened(pose);
-    const Vec3<double> turn = turn_to(c, at), left = of.momentum - of.inertia * turn,
-                       torque = multiply_add(0.25 * dot(turn, left), turn,
-                                             multiply_add(0.5, cross(turn, left), left));
+    const Vec3<double> torque = torque_after(turn_to(c, at), of.inertia, of.momentum);
     const double half = 0.5 * trace(of.inertia);
     const Mat3<double> whole{{{half, 0, 0}, {0, half, 0}, {0, 0, half}}},
         twist = cross_matrix(0.5 * torque);
