@@ -2,6 +2,7 @@
 #pragma once
 #include "binding/adjoint_ops.h"
 #include "binding/contact_ops.h"
+#include "binding/rigid_adjoint.h"
 #include "solver/adjoint/pair_views.h"
 
 #include <cstdint>
@@ -17,6 +18,7 @@ enum LoadedPairsTensor : int {
   pairs_after,
   pairs_poses_before,
   pairs_poses_after,
+  pairs_poses_free,
   pairs_keys,
   pairs_forces,
   pairs_contact
@@ -24,12 +26,16 @@ enum LoadedPairsTensor : int {
 
 // Of a Backend that counts loaded pairs by `most_loaded(forces)`, and refuses more than it takes by `check_pairs`.
 template <class Backend, class T>
-LoadedPairs<T> loaded_pairs_view(at::TensorList pairs, std::int64_t batch, std::int64_t vertices,
+LoadedPairs<T> loaded_pairs_view(at::TensorList pairs, std::int64_t batch, std::int64_t nodes,
                                  const Place& place) {
   constexpr int arrays = int(pairs_contact) + int(contact_array_count);
   TORCH_CHECK_VALUE(pairs.size() == arrays, "pairs must have ", arrays, " arrays, got ",
                     pairs.size());
   LoadedPairs<T> view;
+  // colliders with a mass are two vertices more of the system
+  const bool masses = pairs[int(pairs_contact) + int(contact_rigid)].numel() > 0;
+  const std::int64_t vertices =
+      nodes - (masses ? 2 * pairs[pairs_poses_after].size(1) : std::int64_t(0));
   view.plan = contact_plan_view<T>(pairs.slice(pairs_contact), vertices, place);
   const auto check = [&](LoadedPairsTensor which, at::ScalarType type, at::IntArrayRef shape,
                          const char* meaning) {
@@ -47,6 +53,10 @@ LoadedPairs<T> loaded_pairs_view(at::TensorList pairs, std::int64_t batch, std::
   view.after = reals(pairs_after, {batch, vertices, 3}, "positions after it, m");
   view.poses_before = reals(pairs_poses_before, {batch, c, 7}, "of colliders before the step");
   view.poses_after = reals(pairs_poses_after, {batch, c, 7}, "of colliders after it");
+  view.poses_free = reals(pairs_poses_free, {batch, c, 7}, "of colliders in nobody's way");
+  TORCH_CHECK_VALUE(!masses || pairs[int(pairs_contact) + int(contact_rigid)].size(0) == batch * c,
+                    "contact must have masses of ", batch * c, " colliders or of none, got ",
+                    describe(pairs[int(pairs_contact) + int(contact_rigid)]));
   check(pairs_keys, at::kLong, {batch, m}, "pairs with forces");
   view.keys = pairs[pairs_keys].const_data_ptr<std::int64_t>();
   view.forces = reals(pairs_forces, {batch, m, 4}, "N");
@@ -55,10 +65,10 @@ LoadedPairs<T> loaded_pairs_view(at::TensorList pairs, std::int64_t batch, std::
   return view;
 }
 
-// Gradients by the places of bodies at the end and at the start, by the poses of colliders then, by the friction of bodies
-// and by the thickness.
+// Gradients by the places of bodies at the end and at the start, by the poses of colliders then, by the friction of bodies,
+// by the thickness, and by the free motion and the rows of colliders with a mass.
 struct PairTensors {
-  Tensor end, start, poses_end, poses_start, friction, thickness;
+  Tensor end, start, poses_end, poses_start, friction, thickness, poses_free, rigid;
 };
 
 struct SolvedAdjoint {
@@ -76,16 +86,18 @@ PairTensors pair_gradients_typed(const SolvedAdjoint& s, at::TensorList pairs,
   call.vertex_order = solids.vertex_order;
   call.vertices = solids.vertices;
   call.batch = s.multiplier.size(0);
-  const std::int64_t b = call.batch, vertices = call.vertices;
-  call.pairs = loaded_pairs_view<Backend, T>(pairs, b, vertices, place);
-  const std::int64_t c = call.pairs.plan.colliders, q = call.pairs.plan.bodies;
+  const std::int64_t b = call.batch;
+  call.pairs = loaded_pairs_view<Backend, T>(pairs, b, call.vertices, place);
+  const std::int64_t c = call.pairs.plan.colliders, q = call.pairs.plan.bodies,
+                     vertices = call.pairs.plan.body_vertices,
+                     masses = call.pairs.plan.rigid ? c : 0;
   std::vector<Tensor> kept;
   const auto keep = [&](const Tensor& tensor) {
     kept.push_back(tensor.contiguous());
     return kept.back().template const_data_ptr<T>();
   };
   const auto rows = [&](const Tensor& values) {
-    return Values<T>{keep(values), values.size(0) == 1 ? 0 : vertices};
+    return Values<T>{keep(values), values.size(0) == 1 ? 0 : values.size(1)};
   };
   call.inertia = rows(s.inertia);
   call.inverse = rows(s.inverse);
@@ -95,11 +107,18 @@ PairTensors pair_gradients_typed(const SolvedAdjoint& s, at::TensorList pairs,
   call.projector = s.projector ? keep(*s.projector) : nullptr;
   call.sliding = s.sliding ? keep(*s.sliding) : nullptr;
   const auto made = [&](at::IntArrayRef shape) { return at::zeros(shape, s.multiplier.options()); };
-  const PairTensors out{made({b, vertices, 3}), made({b, vertices, 3}), made({b, c, 7}),
-                        made({b, c, 7}),        made({b, q, q}),        made({b})};
-  call.out = {out.end.mutable_data_ptr<T>(),       out.start.mutable_data_ptr<T>(),
-              out.poses_end.mutable_data_ptr<T>(), out.poses_start.mutable_data_ptr<T>(),
-              out.friction.mutable_data_ptr<T>(),  out.thickness.mutable_data_ptr<T>()};
+  const PairTensors out{made({b, vertices, 3}),
+                        made({b, vertices, 3}),
+                        made({b, c, 7}),
+                        made({b, c, 7}),
+                        made({b, q, q}),
+                        made({b}),
+                        made({b, c, 7}),
+                        made({b, masses, rigid_numbers})};
+  call.out = {out.end.mutable_data_ptr<T>(),        out.start.mutable_data_ptr<T>(),
+              out.poses_end.mutable_data_ptr<T>(),  out.poses_start.mutable_data_ptr<T>(),
+              out.poses_free.mutable_data_ptr<T>(), out.rigid.mutable_data_ptr<T>(),
+              out.friction.mutable_data_ptr<T>(),   out.thickness.mutable_data_ptr<T>()};
   if (b > 0) Backend::pair_gradients(call, s.multiplier);
   return out;
 }
@@ -119,9 +138,35 @@ inline Tensor held_back_pins(const AdjointTensors& t) {
   return none.index_add(1, pins, held.expand({t.after.size(0), -1})).gt(0).unsqueeze(-1);
 }
 
+// The system of a step with its colliders, whose vertices are last, and a step with as many.
+struct WideSystem {
+  Tensor right, inertia, inverse;
+  OptionalTensor projector, sliding;
+  Tensor after, positions;
+  std::vector<Tensor> plan;
+
+  void widen(const RigidSystem& rigid) {
+    const std::int64_t b = after.size(0), more = rigid.right.size(1);
+    const auto add = [](const Tensor& own, const Tensor& added) {
+      return at::cat({own, added}, 1);
+    };
+    right = add(right, rigid.right);
+    inertia = add(inertia.expand({b, -1}), rigid.inertia);
+    inverse = add(inverse.expand({b, -1}), rigid.inverse);
+    if (projector) {
+      const at::TensorOptions options = right.options();
+      projector = add(*projector, at::eye(3, options).expand({b, more, 3, 3}));
+      sliding = add(*sliding, at::zeros({b, more, slide_count, 3}, options));
+    }
+    after = add(after, at::zeros_like(rigid.right));
+    positions = add(positions, at::zeros_like(rigid.right));
+    plan = plan_with_more(plan, more, after.is_cuda());
+  }
+};
+
 // Gradients for positions, velocities and forces [batch, vertices, 3], for the poses of colliders at the end and at the
-// start [batch, colliders, 7], for the friction of bodies and the thickness of contact, then for the wanted arrays of
-// the material. `history`: poses before and after the step, keys and forces of pairs after it; `pushes`: forces between
+// start [batch, colliders, 7], for the friction of bodies, the thickness of contact and the masses of colliders, then for
+// the wanted arrays of the material. `history`: poses before and after the step, keys and forces of pairs after it; `pushes`: forces between
 // bodies [batch, all vertices, 3]. An environment that was taken back passes gradients on to its state. What bodies hold
 // back from its target has no gradient.
 template <class Backend>
@@ -156,14 +201,27 @@ std::vector<Tensor> contact_step_vjp(const Tensor& grad_positions, const Tensor&
   const OptionalTensor free = touching ? OptionalTensor(projector) : OptionalTensor();
   const OptionalTensor slips = touching ? OptionalTensor(sliding) : OptionalTensor();
   std::vector<Tensor> pairs{positions.contiguous(), after.contiguous()};
-  for (const Tensor& array : history) pairs.push_back(array.contiguous());
+  for (const Tensor& array : {history[0], history[1], poses, history[2], history[3]})
+    pairs.push_back(array.contiguous());
   pairs.insert(pairs.end(), contact.begin(), contact.end());
-  const auto [solution, error] =
-      solve<Backend>(t, {right, inertia, inverse, free, slips, pairs}, time_step);
+  WideSystem all{right, inertia, inverse, free, slips, after, positions, plan.vec()};
+  const std::int64_t b = after.size(0), vertices = after.size(1), c = poses.size(1);
+  const bool masses = contact[contact_rigid].numel() > 0;
+  if (masses)
+    all.widen({contact[contact_rigid].view({b, c, rigid_numbers}), poses, history[1],
+               at::where(back, 0.0, grad_poses), back.view({-1, 1})});
+  const AdjointTensors wide{grad_x, grad_v, all.after, all.positions, velocities, forces, material,
+                            all.plan};
+  const auto [solutions, error] = solve<Backend>(
+      wide, {all.right, all.inertia, all.inverse, all.projector, all.sliding, pairs}, time_step);
+  const Tensor solution = solutions.narrow(1, 0, vertices).contiguous();
   Tensor elastic = elastic_product(t, solution, time_step);
-  const SolvedAdjoint solved{right, inertia, inverse, free, slips, solution, elastic};
-  const PairTensors own = is_float ? pair_gradients_typed<Backend, float>(solved, pairs, plan)
-                                   : pair_gradients_typed<Backend, double>(solved, pairs, plan);
+  const SolvedAdjoint solved{
+      all.right,   all.inertia, all.inverse,
+      all.projector, all.sliding, solutions,
+      masses ? at::cat({elastic, at::zeros({b, 2 * c, 3}, elastic.options())}, 1) : elastic};
+  const PairTensors own = is_float ? pair_gradients_typed<Backend, float>(solved, pairs, all.plan)
+                                   : pair_gradients_typed<Backend, double>(solved, pairs, all.plan);
   elastic = at::where(held_back_pins(t), grad_x + grad_v / time_step, elastic + own.end);
   HeldTerms held_terms;
   if (touching) held_terms = {grad_x, elastic, projector, stuck, sliding};
@@ -173,17 +231,18 @@ std::vector<Tensor> contact_step_vjp(const Tensor& grad_positions, const Tensor&
   const DampingProducts damping(t, multiplier, time_step);
   if (damping.some()) x = x - damping.by_start();
   x = x - own.start;
-  const LossMask loss_mask(grad_x, grad_v);
+  const LossMask loss_mask(grad_x, masses ? at::cat({grad_v, all.right}, 1) : grad_v);
   const auto masked = [&](const Tensor& each) { return loss_mask.masked(each); };
   const Tensor reached = poses.eq(history[1]).all(-1, true).logical_and(back.logical_not());
   std::vector<Tensor> found{
       masked(x) + at::where(back, grad_positions, 0.0),
       masked(v) + at::where(back, grad_velocities, 0.0),
       masked(multiplier),
-      at::where(reached, masked(own.poses_end) + grad_poses, 0.0),
+      at::where(reached, masked(own.poses_end) + grad_poses, masked(own.poses_free)),
       masked(own.poses_start) + at::where(back, grad_poses, 0.0),
       masked(own.friction).sum(0),
       masked(own.thickness).sum(0, true),
+      masked(own.rigid).view({-1, rigid_numbers}),
   };
   const MaterialGradients gradients(
       t, multiplier, elastic, damping,

@@ -133,7 +133,7 @@ def samples_of_contact(x: Tensor) -> dict[str, tuple[tuple[Any, ...], dict[str, 
     )
     after, numbers, actual, keys, forces, pushes = (taken[place] for place in (0, 3, 5, 6, 7, 8))
     f, h = noise(state.positions), {"time_step": sim.time_step}
-    pairs = [state.positions, after, poses, actual, keys, forces, *contact]
+    pairs = [state.positions, after, poses, actual, poses, keys, forces, *contact]
     inertia = (sim.masses / sim.time_step**2).detach()
     trained = [array.clone().requires_grad_() if array.is_floating_point() else array for array in contact]
     moving = [array.detach().clone().requires_grad_() for array in state[:2]]

@@ -27,7 +27,8 @@ from torch import Tensor
 
 from .. import _C
 from ..common.warn import warn_user
-from .diagonal import has_damping, named_material, pinned_vertices, step_diagonal
+from .diagonal import has_damping, named_material, pinned_vertices, step_inertia
+from .fake_kernels import CONTACT_LOCAL, CONTACT_RIGID
 
 __all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "adjoint_fallback", "is_recording", "step_gradient"]
 
@@ -35,8 +36,11 @@ __all__ = ["ADJOINT_TOLERANCE", "AdjointCall", "adjoint_fallback", "is_recording
 ADJOINT_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_tolerance, strict=True))
 # At this stretch the rotations hardly change, so the Hessian equals the constant, positive majoriser within 1e-4.
 _STRETCH = 1e4
-# In csrc/binding/contact_adjoint_ops.h: positions before and after a step, and points of colliders; poses.
-_PLACES_OF_PAIRS, _POSES_OF_PAIRS = (0, 1, 18), (2, 3)
+# In csrc/binding/contact_adjoint_ops.h: positions before and after a step, and points of colliders; poses; masses.
+_CONTACT = 7
+_PLACES_OF_PAIRS, _POSES_OF_PAIRS, _RIGID_OF_PAIRS = (0, 1, _CONTACT + CONTACT_LOCAL), (2, 3, 4), _CONTACT + CONTACT_RIGID
+# Powers of the stretch in a row of masses: mass, centre, moment of inertia, angular momentum.
+_RIGID_POWERS = (0, *[1] * 3, *[2] * 6, *[2] * 3)
 
 
 @dataclass(frozen=True)
@@ -115,7 +119,17 @@ def _stretched(pairs: Sequence[Tensor]) -> list[Tensor]:
     for place in _POSES_OF_PAIRS:
         origin, turn = made[place].split([3, 4], dim=-1)
         made[place] = torch.cat([_STRETCH * origin, turn], dim=-1)
+    made[_RIGID_OF_PAIRS] = made[_RIGID_OF_PAIRS] * _STRETCH ** made[_RIGID_OF_PAIRS].new_tensor(_RIGID_POWERS)
     return made
+
+
+def _with_colliders(inertia: Tensor, right: Tensor, pairs: Sequence[Tensor]) -> Tensor:
+    """Inertia of all vertices of a system, which colliders with a mass have last: a shift and a turn each."""
+    if right.shape[1] == inertia.shape[-1]:
+        return inertia
+    mass = pairs[_RIGID_OF_PAIRS][:, 0].unflatten(0, (len(right), -1))
+    of_colliders = torch.stack([mass, torch.zeros_like(mass)], dim=-1).flatten(1)
+    return torch.cat([inertia.expand(len(right), -1), of_colliders], dim=1)
 
 
 def adjoint_fallback(
@@ -162,7 +176,7 @@ def adjoint_fallback(
             return solution.clone()
         _warn_of_no_solution(failed, error)
     # the curvature of contact surfaces is no part of the majoriser
-    inertia, _ = step_diagonal(arrays, material, time_step)
+    inertia = _with_colliders(step_inertia(arrays, material, time_step), right, pairs)
     system = (
         _STRETCH * after,
         torch.where(failed[:, None, None], right, 0.0),

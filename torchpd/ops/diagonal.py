@@ -18,6 +18,7 @@ __all__ = [
     "named_material",
     "pinned_vertices",
     "step_diagonal",
+    "step_inertia",
 ]
 
 STIFFNESS_PLACE = [row.name for row in MATERIAL_TABLE].index("stiffness")
@@ -59,20 +60,24 @@ def pinned_vertices(plan: Sequence[Tensor]) -> Tensor:
     return vertex_order[pin_vertex.long()].long()
 
 
+def step_inertia(plan: Sequence[Tensor], material_arrays: Sequence[Tensor], time_step: float) -> Tensor:
+    """Inertia a_i = m_i / h^2 (1 + damping h) + k_i of every vertex, [V] or [B, V], in N/m; inf at hard pins."""
+    material = named_material(material_arrays)
+    masses, springs = material["masses"], material["pin_stiffness"]
+    held = masses.new_zeros((*springs.shape[:-1], masses.shape[-1]))
+    held = held.index_copy(-1, pinned_vertices(plan), springs)
+    return masses / time_step**2 * (1 + material["damping"].unsqueeze(-1) * time_step) + held
+
+
 def step_diagonal(
     plan: Sequence[Tensor], material_arrays: Sequence[Tensor], time_step: float, *, weighted: bool = True
 ) -> tuple[Tensor, Tensor]:
     """Inertia a and diagonal D of every vertex, [V] or [B, V], in N/m; inf at hard pins.
 
-    a_i = m_i / h^2 (1 + damping h) + k_i;  D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted. With
-    Poisson's ratio 2 mu l_e + 4 lambda takes the place of l_e w_e, and 2 mu + lambda that of w_e. Other elements add
-    theirs, damping 2 mu beta / h l_e.
+    D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted. With Poisson's ratio 2 mu l_e + 4 lambda takes
+    the place of l_e w_e, and 2 mu + lambda that of w_e. Other elements add theirs, damping 2 mu beta / h l_e.
     """
-    material = named_material(material_arrays)
-    masses, springs = material["masses"], material["pin_stiffness"]
-    held = masses.new_zeros((*springs.shape[:-1], masses.shape[-1]))
-    held = held.index_copy(-1, pinned_vertices(plan), springs)
-    inertia = masses / time_step**2 * (1 + material["damping"].unsqueeze(-1) * time_step) + held
+    inertia = step_inertia(plan, material_arrays, time_step)
     return inertia, inertia + torch.ops.torchpd.elastic_diagonal(
         list(material_arrays), list(plan), weighted=weighted, time_step=time_step
     )

@@ -18,9 +18,9 @@ __all__ = ["INFO_WIDTH"]
 INFO_WIDTH = _C.info_numbers
 CONTACT_INFO_WIDTH = 8  # contact_info_count of csrc/contact/views.h
 CONTACT_MISSING = 1  # its column of pairs that the capacity lacks
-# places among the arrays of contact, csrc/binding/contact_ops.h: the body of each vertex, friction, masses of colliders
-# and thickness
-CONTACT_BODY, CONTACT_FRICTION, CONTACT_RIGID, CONTACT_THICKNESS = 4, 16, 17, 18
+# places among the arrays of contact, csrc/binding/contact_ops.h: the body of each vertex, points of colliders, friction,
+# masses of colliders and thickness
+CONTACT_BODY, CONTACT_LOCAL, CONTACT_FRICTION, CONTACT_RIGID, CONTACT_THICKNESS = 4, 14, 16, 17, 18
 
 
 def _register_fake(name: str) -> Callable[[Callable[..., Any]], None]:
@@ -106,7 +106,7 @@ def _(
 ) -> list[Tensor]:
     state = [positions.new_empty(positions.shape) for _ in range(3)]
     moved = [poses.new_empty(poses.shape) for _ in range(2)]
-    own = [positions.new_empty(contact[place].shape) for place in (CONTACT_FRICTION, CONTACT_THICKNESS)]
+    own = [positions.new_empty(contact[place].shape) for place in (CONTACT_FRICTION, CONTACT_THICKNESS, CONTACT_RIGID)]
     asked = zip(material, [True] * len(material) if wanted is None else wanted, strict=True)
     return [*state, *moved, *own, *(array.new_empty(array.shape) for array, one in asked if one)]
 

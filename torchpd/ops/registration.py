@@ -12,7 +12,7 @@ from torch.autograd import forward_ad
 from ..common.tables import MATERIAL_TABLE, MULTILEVEL_TABLE, PLAN_TABLE, STENCIL_TABLE
 from .adjoint import adjoint_fallback
 from .diagonal import CORE_COUNT, STIFFNESS_PLACE
-from .fake_kernels import CONTACT_FRICTION, CONTACT_MISSING, CONTACT_THICKNESS, INFO_WIDTH
+from .fake_kernels import CONTACT_FRICTION, CONTACT_MISSING, CONTACT_RIGID, CONTACT_THICKNESS, INFO_WIDTH
 from .vmap import register_rule
 from .vmap_step import rollout_vjp_rule, step_vjp_rule
 
@@ -335,7 +335,7 @@ def _contact_backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
         return torch.zeros_like(like) if gradient is None else gradient
 
     wanted = list(ctx.needs_input_grad[5])
-    x, v, f, target, start, friction, thickness, *asked = _ops.contact_step_vjp(
+    x, v, f, target, start, friction, thickness, rigid, *asked = _ops.contact_step_vjp(
         known(grad_positions, after),
         known(grad_velocities, after),
         known(grad_poses, poses),
@@ -355,7 +355,7 @@ def _contact_backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
     )
     rows = iter(asked)
     of_contact: list[Tensor | None] = [None] * count_contact
-    of_contact[CONTACT_FRICTION] = friction
+    of_contact[CONTACT_FRICTION], of_contact[CONTACT_RIGID] = friction, rigid
     if ctx.needs_input_grad[7][CONTACT_THICKNESS]:  # a number of the host
         of_contact[CONTACT_THICKNESS] = thickness.cpu()
     return (

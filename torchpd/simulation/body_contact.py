@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from ..common.checks import check_scalar
-from ..common.rigid_motion import refuse_gradients
 from ..ops.diagonal import named_material
 from ..ops.fake_kernels import CONTACT_FRICTION, CONTACT_RIGID, CONTACT_THICKNESS
 from ..plan.contact_clusters import contact_clusters
@@ -187,7 +186,6 @@ class BodyContact:
         if rigid is not None:
             after = _ops.motion_after(history[0], goal, rates, masses, actual, rigid.numbers, time_step=time_step)
             motion = torch.where(missing, motion, after)
-            positions, velocities, actual, motion = refuse_gradients(positions, velocities, actual, motion)
         flow = before.flow
         if flow.shape[-2]:
             (flowed,) = _ops.next_history(positions, material, plan, time_step=time_step)

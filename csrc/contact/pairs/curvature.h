@@ -16,7 +16,8 @@
 namespace pd::inline PD_TARGET {
 
 // Share of the friction bound below which a tangential force sticks, and share of it that the slip
-// of one iteration would have to take back.
+// of one iteration would have to take back. A pair whose slip would take back
+// all of it slides.
 constexpr double pair_sticking = 1e-3;
 // Weights that are negative by less count as zero, so that a foot on the rim of a face is inside.
 constexpr double feature_tie = 1e-6;
@@ -204,8 +205,9 @@ PD_HD LoadedPair<T> loaded_pair(bool edges, const Vec3<T> (&end)[4], const Vec3<
     yielding = multiply_add(pair.frame.weight[a] * pair.frame.weight[a], inverse[a], yielding);
   const Vec3<T> slip = pair_slip(pair.frame, end, start);
   const T pull = square_root(dot(tangential_force, tangential_force));
-  const bool slides = pull >= T(1 - pair_sticking) * bound &&
-                      square_root(dot(slip, slip)) > T(pair_sticking) * bound * yielding;
+  const T slipped = square_root(dot(slip, slip)), reach = bound * yielding;
+  const bool slides = slipped > T(pair_sticking) * reach &&
+                      (pull >= T(1 - pair_sticking) * bound || slipped > reach);
   pair.state = slides ? PairState::slides : PairState::sticks;
   return pair;
 }
@@ -246,6 +248,7 @@ struct PairSlopes {
   T load[12][12];   // of -w (x) f, by the corners at the end
   T row[3][12];     // of the gap and of the slips, by these: C
   T column[3][12];  // of w (x) f by the multipliers: B
+  Vec3<T> force;    // f
   // of a pair that slides, else 0: mu lambda / |s| [N/m], by which its slip turns across
   T stiffness;
   Vec3<T> across;
@@ -263,6 +266,7 @@ struct PairSlopes {
         column[k][3 * a] = of.x, column[k][3 * a + 1] = of.y, column[k][3 * a + 2] = of.z;
       }
     }
+    force = terms.force;
     const Vec3<T> slip = pair_slip(terms.frame, end, start);
     const T length = square_root(dot(slip, slip));
     stiffness = slides ? pair.friction * lambda / length : T(0);

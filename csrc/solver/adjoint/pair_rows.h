@@ -26,8 +26,8 @@ class PairRows {
  public:
   using Place = Vec3<double>;
 
-  PD_HD PairRows(const Team& team, const PairMemory& memory, int vertices)
-      : team_(team), m_(memory), vertices_(vertices) {}
+  PD_HD PairRows(const Team& team, const PairMemory& memory, int nodes)
+      : team_(team), m_(memory), nodes_(nodes) {}
 
   // Of rows that are there. `skewed`: B differs from C.
   PD_CALLED void factor(const PairFactors& factors, double tolerance, bool skewed) {
@@ -58,7 +58,7 @@ class PairRows {
     team_.once([&] { m_.counts->pivots = pivots; });
   }
 
-  // `read(vertex)`: of the field; `add(vertex, change)`: to it.
+  // `read(node)`: of the field; `add(node, change)`: to it.
   template <class Read, class Add>
   PD_HD void project(const Read& read, const Add& add) const {
     PD_ROLLED
@@ -76,10 +76,10 @@ class PairRows {
     PD_ROLLED
     for (int round = 0; round < rounds; ++round) {
       team_.each(m_.counts->rows, [&](int p) {
-        const int* const moves = m_.corner + 4 * std::int64_t(p);
+        const std::int64_t at = first_slot(p);
         double sum = 0;
-        for (int a = 0; a < 4; ++a)
-          if (moves[a] >= 0) sum += dot(m_.row[p].pushed[a], read(moves[a]));
+        for (int s = 0; s < m_.slots; ++s)
+          if (m_.moves[at + s] >= 0) sum += dot(m_.pushed[at + s], read(m_.moves[at + s]));
         m_.along[p] = sum;
       });
       lower_transposed(m_.along, m_.turned);
@@ -118,10 +118,11 @@ class PairRows {
 
   template <class Visit>
   PD_HD void each_held(int p, const Visit& visit) const {
-    const int* const moves = m_.corner + 4 * std::int64_t(p);
-    for (int a = 0; a < 4; ++a)
-      if (moves[a] >= 0) visit(moves[a], m_.row[p].held[a]);
+    const std::int64_t at = first_slot(p);
+    for (int s = 0; s < m_.slots; ++s)
+      if (m_.moves[at + s] >= 0) visit(m_.moves[at + s], m_.held[at + s]);
   }
+  PD_HD std::int64_t first_slot(int p) const { return std::int64_t(m_.slots) * p; }
   PD_HD const PairPatch& patch_of(int pivot) const { return m_.patch[m_.of_patch[pivot]]; }
   PD_HD static int rows_of(const PairPatch& patch) { return patch.end - patch.begin; }
 
@@ -196,15 +197,15 @@ class PairRows {
   // Adds factor(v) times C_r^T sums.
   template <class Add, class Factor>
   PD_HD void add_held(const Add& add, const Factor& factor) const {
-    team_.each(vertices_, [&](int v) {
+    team_.each(nodes_, [&](int v) {
       if (!(m_.inverse[v] > 0)) return;
       Place sum = {0, 0, 0};
       bool some = false;
       for (int n = m_.start[v]; n < m_.start[v + 1]; ++n) {
-        const int item = m_.entry[n] / 4, a = m_.entry[n] % 4;
+        const int item = m_.entry[n] / m_.slots, s = m_.entry[n] % m_.slots;
         for (int p = m_.first[item]; p < m_.end[item]; ++p) {
           if (m_.as_pivot[p] < 0) continue;
-          sum = sum + m_.sums[m_.as_pivot[p]] * m_.row[p].held[a];
+          sum = sum + m_.sums[m_.as_pivot[p]] * m_.held[first_slot(p) + s];
           some = true;
         }
       }
@@ -222,13 +223,13 @@ class PairRows {
 
   // Row p D^-1 C_q^T
   PD_HD double coupled(int p, int q) const {
-    const int* const of_p = m_.corner + 4 * std::int64_t(p);
-    const int* const of_q = m_.corner + 4 * std::int64_t(q);
+    const std::int64_t of_p = first_slot(p), of_q = first_slot(q);
     double sum = 0;
-    for (int b = 0; b < 4; ++b) {
-      for (int a = 0; a < 4; ++a) {
-        if (of_q[b] >= 0 && of_p[a] == of_q[b])
-          sum += dot(m_.row[p].held[a], m_.inverse[of_q[b]] * m_.row[q].held[b]);
+    for (int b = 0; b < m_.slots; ++b) {
+      const int node = m_.moves[of_q + b];
+      for (int a = 0; a < m_.slots; ++a) {
+        if (node >= 0 && m_.moves[of_p + a] == node)
+          sum += dot(m_.held[of_p + a], m_.inverse[node] * m_.held[of_q + b]);
       }
     }
     return sum;
@@ -299,13 +300,13 @@ class PairRows {
     for (int i = 0; i < rank; ++i) {
       const double* const column = column_of(patch, i);
       // B L of this column
-      team_.each(vertices_, [&](int v) {
+      team_.each(nodes_, [&](int v) {
         Place sum = {0, 0, 0};
         for (int n = m_.start[v]; n < m_.start[v + 1]; ++n) {
-          const int item = m_.entry[n] / 4;
+          const int item = m_.entry[n] / m_.slots, s = m_.entry[n] % m_.slots;
           if (m_.first[item] < patch.begin || m_.first[item] >= patch.end) break;
           for (int p = m_.first[item]; p < m_.end[item]; ++p)
-            sum = sum + column[p - patch.begin] * m_.row[p].pushed[m_.entry[n] % 4];
+            sum = sum + column[p - patch.begin] * m_.pushed[first_slot(p) + s];
         }
         m_.field[v] = sum;
       });
@@ -373,7 +374,7 @@ class PairRows {
 
   const Team& team_;
   const PairMemory& m_;
-  int vertices_;
+  int nodes_;
   PairFactors f_{};
   bool skewed_ = false;
 };

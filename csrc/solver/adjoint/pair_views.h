@@ -12,7 +12,8 @@ template <class T>
 struct LoadedPairs {
   ContactPlan<T> plan;
   const T *before, *after;              // [vertices, 3] of bodies
-  const T *poses_before, *poses_after;  // [colliders, 7]
+  // [colliders, 7]; free: where colliders go that nothing is in the way of
+  const T *poses_before, *poses_after, *poses_free;
   const std::int64_t* keys;             // [capacity], -1 pads at the end
   const T* forces;                      // [capacity, 4]
   std::int64_t most = 0;                // loaded pairs of any environment, or more
@@ -22,12 +23,14 @@ struct LoadedPairs {
 template <class T>
 struct PairGradients {
   T *end, *start;              // [batch, vertices, 3] of bodies: K^T l + C^T nu, by the places then
-  T *poses_end, *poses_start;  // [batch, colliders, 7]
+  T *poses_end, *poses_start;  // [batch, colliders, 7], as if all colliders moved by hand at the end
+  // of colliders with a mass that leave their free motion, else 0: [batch, colliders, 7], and 13
+  T *poses_free, *rigid;
   T* friction;                 // [batch, bodies, bodies]
   T* thickness;                // [batch]
 };
 
-// A solved adjoint, as in a ConjugateCall; [batch, vertices, 3] each.
+// A solved adjoint, as in a ConjugateCall; [batch, vertices, 3] each. Colliders with a mass are two vertices more.
 template <class T>
 struct PairGradientsCall {
   using real = T;

@@ -2,7 +2,8 @@
 // one pair, and solver/adjoint/pair_rows.h for the directions that they leave.
 //
 // A projector and the vectors of sliding of a vertex that touches planes or spheres of the scene
-// restrict its rows.
+// restrict its rows. Colliders with a mass that leave their free motion have nodes of their own:
+// solver/adjoint/rigid_nodes.h.
 #pragma once
 #include "math/screw.h"
 #include "solver/adjoint/friction.h"
@@ -15,7 +16,8 @@ namespace pd::inline PD_TARGET {
 template <class T>
 PD_HD PairSizes pair_sizes(const LoadedPairs<T>& call) {
   const ContactPlan<T>& plan = call.plan;
-  return {plan.vertices, plan.body_vertices, plan.capacity, call.most, plan.bodies};
+  return {plan.body_vertices, plan.rigid ? plan.colliders : 0, plan.capacity, call.most,
+          plan.bodies};
 }
 
 // `Team`: as OneThread
@@ -24,7 +26,7 @@ class AdjointPairs {
  public:
   using Place = Vec3<double>;
 
-  // `vertex_order`: the user's numbers of the vertices of bodies
+  // `vertex_order`: the user's numbers of the nodes
   PD_HD AdjointPairs(const LoadedPairs<T>& call, const int* vertex_order, const Team& team,
                      const PairMemory& memory, std::int64_t environment)
       : call_(call),
@@ -34,9 +36,10 @@ class AdjointPairs {
         m_(memory),
         environment_(environment),
         count_(call.plan.body_vertices),
-        rows_(team, memory, call.plan.body_vertices) {}
+        nodes_(int(pair_sizes(call).nodes())),
+        rows_(team, memory, nodes_) {}
 
-  // Reads the pairs. `inverse(i)`: a reference to 1 / D of a vertex, to whose D sliding pairs add.
+  // Reads the pairs. `inverse(i)`: a reference to 1 / D of a node, to whose D sliding pairs add.
   // `projector(i)`, `sliding(i)`: as in a ConjugateCall, or null. `provide(low, square)`: memory for
   // factors of such sizes.
   template <class Inverse, class Projector, class Sliding, class Provide>
@@ -44,6 +47,7 @@ class AdjointPairs {
                       const Provide& provide) {
     find(inverse);
     index();
+    push_colliders(inverse);
     weigh(inverse);
     find_patches();
     team_.each(m_.counts->pairs, [&](int n) {
@@ -55,10 +59,16 @@ class AdjointPairs {
 
   PD_HD PairRows<Team>& rows() { return rows_; }
   PD_HD const PairRows<Team>& rows() const { return rows_; }
-  PD_HD bool some() const { return m_.counts->pairs > 0; }
+  // whether the matrix has other terms than that of the symmetric solve
+  PD_HD bool some() const {
+    for (int v = count_; v < nodes_; ++v)
+      if (m_.inverse[v] > 0) return true;
+    return m_.counts->pairs > 0;
+  }
 
-  // Visits visit(i, K^T l) for every vertex that moves; `read(i)`: l there. `positive`: the positive
-  // part alone, the turn of slips. Curvature of distances is negative where corners meet.
+  // Visits visit(i, K^T l) for every node that moves; `read(i)`: l there. `positive`: the positive
+  // part alone, the turn of slips and the inertia of colliders. Curvature of distances is negative
+  // where corners meet.
   template <class Read, class Visit>
   PD_HD void multiply(bool positive, const Read& read, const Visit& visit) const {
     team_.each(4 * std::int64_t(m_.counts->pairs), [&](int n) {
@@ -66,7 +76,7 @@ class AdjointPairs {
       const auto& weight = item.pair.frame.weight;
       const int a = n % 4;
       m_.part[n] = {0, 0, 0};
-      if (item.moves[a] < 0) return;
+      if (item.slot[a] < 0 || item.moves[item.slot[a]] < 0) return;
       double l[12];
       gather(item, read, l);
       if (positive) {
@@ -82,8 +92,13 @@ class AdjointPairs {
         for (int j = 0; j < 3; ++j) product[j] += item.slopes.load[i][3 * a + j] * l[i];
       m_.part[n] = {product[0], product[1], product[2]};
     });
-    team_.each(count_, [&](int v) {
-      if (m_.start[v] < m_.start[v + 1] && m_.inverse[v] > 0) visit(v, sum_of(v, m_.part));
+    team_.each(nodes_, [&](int v) {
+      if (!(m_.inverse[v] > 0) || (v < count_ && m_.start[v] == m_.start[v + 1])) return;
+      const Place sum = sum_of(v, m_.part);
+      if (!is_turn(v)) return visit(v, sum);
+      const RigidNode& own = m_.rigid[(v - count_) / 2];
+      const Place z = read(v);
+      visit(v, sum + (positive ? own.inertia * z : z * own.stiffness));
     });
   }
 
@@ -117,6 +132,7 @@ class AdjointPairs {
     });
     to_places(m_.part, call_.poses_after, out.end, out.poses_end);
     to_places(m_.part_of_start, call_.poses_before, out.start, out.poses_start);
+    to_colliders(read, out);
     to_friction(read, out.friction + environment_ * plan_.bodies * plan_.bodies);
     team_.sums(
         1, pairs,
@@ -150,14 +166,44 @@ class AdjointPairs {
   template <class Read>
   PD_HD void gather(const PairItem& item, const Read& read, double (&l)[12]) const {
     for (int a = 0; a < 4; ++a) {
-      const Place of = item.node[a] < count_ ? read(item.node[a]) : Place{0, 0, 0};
+      Place of = {0, 0, 0};
+      if (const int s = item.slot[a]; s >= 0) {
+        of = read(item.node[s]);
+        if (item.node[s] >= count_) of = of + cross(read(item.node[s + 1]), item.arm[a]);
+      }
       l[3 * a] = of.x, l[3 * a + 1] = of.y, l[3 * a + 2] = of.z;
     }
   }
 
+  PD_HD bool is_turn(int node) const { return node >= count_ && (node - count_) % 2 != 0; }
+
+  // What forces at(corner) are on a slot.
+  template <class At>
+  PD_HD Place on_slot(const PairItem& item, int s, const At& at) const {
+    const int node = item.node[s], first = item.corner[s];
+    if (node < count_) return at(first);
+    const int end = first > 0 ? 4 : item.pair.edges ? 2 : 1;
+    Place sum = {0, 0, 0};
+    for (int a = first; a < end; ++a)
+      sum = sum + (is_turn(node) ? cross(item.arm[a], at(a)) : at(a));
+    return sum;
+  }
+  PD_HD double slot_weight(const PairItem& item, int s) const {
+    if (item.node[s] < count_) return absolute(item.pair.frame.weight[item.corner[s]]);
+    // of all directions: arms turn to any
+    Place sum = {0, 0, 0};
+    const int first = item.corner[s], end = first > 0 ? 4 : item.pair.edges ? 2 : 1;
+    for (int a = first; a < end; ++a) sum = sum + item.pair.frame.weight[a] * item.arm[a];
+    return is_turn(item.node[s]) ? square_root(dot(sum, sum)) : 1.0;
+  }
+
   PD_HD Place sum_of(int node, const Vec3<double>* part) const {
     Place sum = {0, 0, 0};
-    for (int n = m_.start[node]; n < m_.start[node + 1]; ++n) sum = sum + part[m_.entry[n]];
+    for (int n = m_.start[node]; n < m_.start[node + 1]; ++n) {
+      const int number = m_.entry[n] / m_.slots;
+      sum = sum + on_slot(m_.item[number], m_.entry[n] % m_.slots,
+                          [&](int a) { return part[4 * number + a]; });
+    }
     return sum;
   }
 
@@ -169,6 +215,12 @@ class AdjointPairs {
       m_.slot[n] = call_.keys[row] >= 0 && call_.forces[4 * row] > T(0);
     });
     team_.each(count_, [&](int i) { m_.internal[order_[i]] = i; });
+    team_.each(plan_.rigid ? plan_.colliders : 0, [&](int c) {
+      const std::int64_t at = environment_ * plan_.colliders + c;
+      if (inverse(count_ + 2 * c) > T(0))
+        m_.rigid[c].set(plan_.rigid + rigid_numbers * at, call_.poses_before + 7 * at,
+                        call_.poses_after + 7 * at, call_.poses_free + 7 * at);
+    });
     team_.scan(m_.slot, plan_.capacity);
     team_.once([&] { m_.counts->pairs = m_.slot[plan_.capacity]; });
     team_.each(plan_.capacity, [&](int n) {
@@ -199,18 +251,41 @@ class AdjointPairs {
       for (int a = 0; a < 3; ++a)
         item.vertex[1 + a] = plan_.triangle[3 * (key % plan_.triangles) + a];
     }
-    double weights[4];
-    for (int a = 0; a < 4; ++a) {
-      const int v = item.vertex[a];
-      item.node[a] = v < count_ ? m_.internal[v] : v;
-      weights[a] = v < count_ ? double(inverse(item.node[a])) : 0.0;
-      item.moves[a] = weights[a] > 0 ? item.node[a] : -1;
-    }
     const int first = plan_.body[item.vertex[0]], last = plan_.body[item.vertex[3]];
     item.bodies = first * plan_.bodies + last;
     item.has_scene_thickness = first != last || !is_close_at_rest(key);
     Place after[4], before[4];
     corners(item, after, before);
+    double weights[4];
+    int slots = 0;
+    const auto add_slot = [&](int node, int corner) {
+      item.node[slots] = node;
+      item.corner[slots] = corner;
+      item.moves[slots] = inverse(node) > T(0) ? node : -1;
+      return slots++;
+    };
+    for (int a = 0; a < 4; ++a) {
+      const int v = item.vertex[a];
+      item.arm[a] = {0, 0, 0};
+      item.slot[a] = -1;
+      weights[a] = 0;
+      if (v < count_) {
+        item.slot[a] = add_slot(m_.internal[v], a);
+        weights[a] = double(inverse(m_.internal[v]));
+        continue;
+      }
+      const int node = count_ + 2 * plan_.collider[v];
+      if (!plan_.rigid || !(inverse(node) > T(0))) continue;
+      if (a == 0 || a == (edges ? 2 : 1)) {
+        add_slot(node, a);
+        add_slot(node + 1, a);
+      }
+      const RigidNode& own = m_.rigid[plan_.collider[v]];
+      item.slot[a] = slots - 2;
+      item.arm[a] = (1 / own.size) * (after[a] - own.center);
+      weights[a] = rigid_yield / own.at.weight();
+    }
+    for (; slots < most_slots; ++slots) item.node[slots] = item.moves[slots] = -1;
     item.pair = loaded_pair(edges, after, before, weights, double(plan_.friction[item.bodies]),
                             double(f[0]), Place{double(f[1]), double(f[2]), double(f[3])});
     item.slopes.set(item.pair, after, before);
@@ -226,17 +301,21 @@ class AdjointPairs {
     return begin < plan_.rest_pairs && plan_.rest_key[begin] == key;
   }
 
-  // Corners of every node, in the order of the items.
+  // Slots of every node, in the order of the items.
   PD_HD void index() {
-    const int corners_count = 4 * m_.counts->pairs;
-    team_.each(plan_.vertices, [&](int v) { m_.start[v] = 0; });
-    team_.each(corners_count, [&](int n) { team_.add(m_.start + m_.item[n / 4].node[n % 4], 1); });
-    team_.scan(m_.start, plan_.vertices);
-    team_.each(plan_.vertices, [&](int v) { m_.cursor[v] = m_.start[v]; });
-    team_.each(corners_count,
-               [&](int n) { m_.entry[team_.add(m_.cursor + m_.item[n / 4].node[n % 4], 1)] = n; });
+    const int slots = m_.slots, all = slots * m_.counts->pairs;
+    const auto node = [&](int n) { return m_.item[n / slots].node[n % slots]; };
+    team_.each(nodes_, [&](int v) { m_.start[v] = 0; });
+    team_.each(all, [&](int n) {
+      if (node(n) >= 0) team_.add(m_.start + node(n), 1);
+    });
+    team_.scan(m_.start, nodes_);
+    team_.each(nodes_, [&](int v) { m_.cursor[v] = m_.start[v]; });
+    team_.each(all, [&](int n) {
+      if (node(n) >= 0) m_.entry[team_.add(m_.cursor + node(n), 1)] = n;
+    });
     // they came in the order of threads
-    team_.each(plan_.vertices, [&](int v) {
+    team_.each(nodes_, [&](int v) {
       for (int n = m_.start[v] + 1; n < m_.start[v + 1]; ++n) {
         const int own = m_.entry[n];
         int to = n;
@@ -246,31 +325,49 @@ class AdjointPairs {
     });
   }
 
+  // Adds the forces of pairs to the stiffness of the turns of colliders.
+  template <class Inverse>
+  PD_HD void push_colliders(const Inverse& inverse) {
+    team_.each(plan_.rigid ? plan_.colliders : 0, [&](int c) {
+      const int node = count_ + 2 * c + 1;
+      if (!(inverse(node) > T(0))) return;
+      for (int n = m_.start[node]; n < m_.start[node + 1]; ++n) {
+        const PairItem& item = m_.item[m_.entry[n] / m_.slots];
+        on_slot(item, m_.entry[n] % m_.slots, [&](int a) {
+          m_.rigid[c].push(item.arm[a], -item.pair.frame.weight[a] * item.slopes.force);
+          return item.arm[a];
+        });
+      }
+    });
+  }
+
   // Steps of the pairs; adds to D the stiffness by which the slips turn.
   template <class Inverse>
   PD_HD void weigh(const Inverse& inverse) {
-    team_.each(count_, [&](int v) {
+    const auto slot = [&](int n, const auto& visit) {
+      const PairItem& item = m_.item[m_.entry[n] / m_.slots];
+      visit(item, slot_weight(item, m_.entry[n] % m_.slots));
+    };
+    team_.each(nodes_, [&](int v) {
       m_.spread[v] = 0;
       for (int n = m_.start[v]; n < m_.start[v + 1]; ++n)
-        m_.spread[v] += absolute(m_.item[m_.entry[n] / 4].pair.frame.weight[m_.entry[n] % 4]);
+        slot(n, [&](const PairItem&, double weight) { m_.spread[v] += weight; });
     });
     team_.each(m_.counts->pairs, [&](int n) {
       PairItem& item = m_.item[n];
       double yielding = 0;
-      for (int a = 0; a < 4; ++a) {
-        const int v = item.node[a];
-        if (v < count_)
-          yielding += absolute(item.pair.frame.weight[a]) * m_.spread[v] * double(inverse(v));
+      for (int s = 0; s < m_.slots; ++s) {
+        const int v = item.node[s];
+        if (v >= 0) yielding += slot_weight(item, s) * m_.spread[v] * double(inverse(v));
       }
       item.step = yielding > 0 ? 1 / yielding : 0.0;
     });
-    team_.each(count_, [&](int v) {
+    team_.each(nodes_, [&](int v) {
       double more = 0;
-      for (int n = m_.start[v]; n < m_.start[v + 1]; ++n) {
-        const PairItem& item = m_.item[m_.entry[n] / 4];
-        const double weight = item.pair.frame.weight[m_.entry[n] % 4];
-        more += item.slopes.stiffness * weight * weight;
-      }
+      for (int n = m_.start[v]; n < m_.start[v + 1]; ++n)
+        slot(n, [&](const PairItem& item, double weight) {
+          more += item.slopes.stiffness * weight * weight;
+        });
       T& own = inverse(v);
       if (more > 0 && own > T(0)) own = T(1 / (1 / double(own) + more));
       m_.inverse[v] = double(own);
@@ -284,11 +381,11 @@ class AdjointPairs {
     team_.each(pairs, [&](int n) { m_.label[n] = n; });
     for (;;) {
       team_.once([&] { m_.counts->changed = 0; });
-      team_.each(count_, [&](int v) {
+      team_.each(nodes_, [&](int v) {
         int least = pairs;
         if (m_.inverse[v] > 0) {
           for (int n = m_.start[v]; n < m_.start[v + 1]; ++n)
-            least = min_of(least, m_.label[m_.entry[n] / 4]);
+            least = min_of(least, m_.label[m_.entry[n] / m_.slots]);
         }
         m_.least[v] = least;
       });
@@ -307,14 +404,14 @@ class AdjointPairs {
       if (!changed) break;
     }
     team_.each(pairs, [&](int n) { m_.size[n] = m_.other[n] = 0; });
-    team_.each(count_, [&](int v) {
+    team_.each(nodes_, [&](int v) {
       if (m_.least[v] < pairs) team_.add(m_.other + m_.least[v], 1);
     });
     team_.each(pairs, [&](int n) { team_.add(m_.size + m_.label[n], m_.item[n].pair.rows()); });
     team_.once([&] { number_rows(); });
   }
 
-  // `size`, `other`: rows and vertices of the patch that an item names
+  // `size`, `other`: rows and nodes of the patch that an item names
   PD_HD void number_rows() {
     int rows = 0, patches = 0;
     std::int64_t low = 0, square = 0;
@@ -348,24 +445,27 @@ class AdjointPairs {
     const PairItem& item = m_.item[number];
     const double scale = sqrt(item.step);
     const int p = m_.first[number] + k;
-    PairRow& row = m_.row[p];
+    const std::int64_t at_slots = std::int64_t(m_.slots) * p;
     bool skewed = item.pair.state != PairState::smooth;
     m_.of_item[p] = number;
-    for (int a = 0; a < 4; ++a) {
-      const int v = item.moves[a];
-      m_.corner[4 * std::int64_t(p) + a] = v;
-      row.held[a] = row.pushed[a] = {0, 0, 0};
+    for (int n = 0; n < m_.slots; ++n) {
+      const int v = item.moves[n];
+      Place &held = m_.held[at_slots + n], &pushed = m_.pushed[at_slots + n];
+      m_.moves[at_slots + n] = v;
+      held = pushed = {0, 0, 0};
       if (v < 0) continue;
       const auto part = [&](const double (&from)[12]) {
-        return scale * Place{from[3 * a], from[3 * a + 1], from[3 * a + 2]};
+        return scale * on_slot(item, n, [&](int a) {
+                 return Place{from[3 * a], from[3 * a + 1], from[3 * a + 2]};
+               });
       };
-      Place pushed = part(item.slopes.column[k]);
+      pushed = part(item.slopes.column[k]);
       if (const T* s = sliding(v)) {
         skewed = skewed || slides(s);
         pushed = pushed + dot(pushed, at(s + 3 * slide_normal)) * at(s + 3 * slide_along);
       }
-      row.held[a] = projected(part(item.slopes.row[k]), projector(v));
-      row.pushed[a] = projected(pushed, projector(v));
+      held = projected(part(item.slopes.row[k]), projector(v));
+      pushed = projected(pushed, projector(v));
     }
     if (skewed) team_.add(&m_.counts->skewed, 1);
   }
@@ -379,30 +479,49 @@ class AdjointPairs {
 
   // Sums the parts of corners, by the places of bodies and the poses of colliders.
   PD_HD void to_places(const Vec3<double>* part, const T* poses, T* bodies, T* to) const {
-    team_.each(plan_.vertices, [&](int node) {
+    team_.each(count_, [&](int node) {
       const Place sum = sum_of(node, part);
-      m_.field[node] = sum;
-      if (node >= count_) return;
       T* const own = bodies + 3 * (environment_ * count_ + order_[node]);
       own[0] = T(sum.x), own[1] = T(sum.y), own[2] = T(sum.z);
     });
     team_.sums(
-        7 * std::int64_t(plan_.colliders), plan_.vertices - count_,
-        [&](int n, int v) { return by_pose(n, count_ + v, poses); },
+        7 * std::int64_t(plan_.colliders), 4 * m_.counts->pairs,
+        [&](int n, int k) {
+          const int v = m_.item[k / 4].vertex[k % 4];
+          return v < count_ ? 0.0 : by_pose(n, v, part[k], poses);
+        },
         [&](int n, double sum) { to[7 * environment_ * plan_.colliders + n] = T(-sum); });
   }
 
   // By number n of the poses, from the place of one vertex. With u = axis x p a vertex is at
   // origin + p + 2 w u + 2 axis x u.
-  PD_HD double by_pose(int n, int v, const T* poses) const {
+  PD_HD double by_pose(int n, int v, const Place& g, const T* poses) const {
     if (plan_.collider[v] != n / 7) return 0;
     const T* const pose = poses + 7 * (environment_ * plan_.colliders + plan_.collider[v]);
     const Place p = at(plan_.local + 3 * std::int64_t(v - count_)), axis = at(pose + 4),
-                g = m_.field[v], u = cross(axis, p);
+                u = cross(axis, p);
     const double w(pose[3]);
     const Place turned = 2.0 * (w * cross(p, g) + cross(u, g) + cross(p, cross(g, axis)));
     const double own[7] = {g.x, g.y, g.z, 2 * dot(g, u), turned.x, turned.y, turned.z};
     return own[n % 7];
+  }
+
+  // By the inputs of colliders that leave their free motion; adds to what their poses at the start have.
+  template <class Read>
+  PD_HD void to_colliders(const Read& read, const PairGradients<T>& out) const {
+    team_.each(plan_.rigid ? std::int64_t(rigid_inputs) * plan_.colliders : 0, [&](int n) {
+      const int c = n / rigid_inputs, input = n % rigid_inputs, node = count_ + 2 * c;
+      if (!(m_.inverse[node] > 0)) return;
+      const std::int64_t at = environment_ * plan_.colliders + c;
+      const double found = m_.rigid[c].gradient(input, read(node), read(node + 1));
+      const int pose = input - rigid_numbers;
+      if (pose < 0) {
+        out.rigid[rigid_numbers * at + input] = T(found);
+      } else {
+        T& to = pose < 7 ? out.poses_free[7 * at + pose] : out.poses_start[7 * at + pose - 7];
+        to = T(double(to) + found);
+      }
+    });
   }
 
   // f = lambda (n - mu s / |s|): column 0 of B less that of a smooth pair, over -mu
@@ -435,7 +554,7 @@ class AdjointPairs {
   const Team& team_;
   const PairMemory& m_;
   std::int64_t environment_;
-  int count_;  // vertices of bodies
+  int count_, nodes_;  // vertices of bodies; all
   PairRows<Team> rows_;
 };
 

@@ -32,7 +32,8 @@ __all__ = ["ContactGradients", "SolvedContact", "contact_adjoint", "pair_frames"
 
 Array = NDArray[np.float64]
 
-STICKING = 1e-3  # shares of the friction bound: of the force below which a pair sticks, and of what its slip pulls
+STICKING = 1e-3  # shares of the friction bound: of the force below which a pair sticks, and of what its slip pulls; one
+# whose slip pulls more than the bound slides
 TIE = 1e-9  # relative: of equally close features the larger one counts
 PARALLEL = 0.05  # sine of the angle of two edges below which their closest points are frozen
 
@@ -139,8 +140,9 @@ class _Pairs:
         inverse[: len(free)] = torch.where(free, 1.0 / torch.tensor(solved.problem.weighted_diagonal), 0.0)
         each = inverse[self.pairs.vertices]
         bound = self.pairs.friction * solved.normal
-        held = solved.tangential.norm(dim=1) < (1.0 - STICKING) * bound
-        held |= slip.norm(dim=1) <= STICKING * bound * (weights**2 * each).sum(dim=1)
+        slipped, reach = slip.norm(dim=1), bound * (weights**2 * each).sum(dim=1)
+        held = (solved.tangential.norm(dim=1) < (1.0 - STICKING) * bound) & (slipped <= reach)
+        held |= slipped <= STICKING * reach
         self.states = torch.where(bound > 0.0, torch.where(held, 2, 1), 0)
         sums = torch.zeros_like(inverse).index_add(0, self.pairs.vertices.reshape(-1), weights.abs().reshape(-1))
         self.steps = 1.0 / (weights.abs() * sums[self.pairs.vertices] * each).sum(dim=1)
