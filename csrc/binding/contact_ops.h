@@ -50,8 +50,8 @@ enum ContactSize : int {
 };
 
 template <class T>
-ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertices,
-                                 const Place& place) {
+ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t batch,
+                                 std::int64_t body_vertices, const Place& place) {
   TORCH_CHECK_VALUE(arrays.size() == contact_array_count, "contact must have ",
                     int(contact_array_count), " arrays, got ", arrays.size(),
                     "; compile the scene again");
@@ -106,14 +106,15 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t body_vertic
   plan.local =
       reals(contact_local, plan.vertices - plan.body_vertices, 3, "points of colliders [m]");
   plan.cell = reals(contact_cell, plan.vertices, 1, "mean edge of each vertex's body [m]");
-  // [bodies, bodies], also of one body
-  check_storage(arrays[contact_friction], scalar_type<T>, place, "contact",
-                "friction of pairs of bodies");
-  TORCH_CHECK_VALUE(arrays[contact_friction].numel() == std::int64_t(plan.bodies) * plan.bodies,
-                    "contact must have a friction of every pair of its ", plan.bodies,
-                    " bodies, got ", describe(arrays[contact_friction]),
-                    "; compile the scene again");
-  plan.friction = arrays[contact_friction].const_data_ptr<T>();
+  const Tensor& friction = arrays[contact_friction];
+  const std::int64_t q = plan.bodies;
+  check_storage(friction, scalar_type<T>, place, "contact", "friction of pairs of bodies");
+  TORCH_CHECK_VALUE(friction.sizes() == at::IntArrayRef({q, q}) ||
+                        friction.sizes() == at::IntArrayRef({batch, q, q}),
+                    "contact_friction must be [", q, ", ", q, "] or [", batch, ", ", q, ", ", q,
+                    "], of every pair of bodies, got ", describe(friction));
+  plan.friction = friction.const_data_ptr<T>();
+  plan.friction_stride = friction.dim() == 3 ? q * q : 0;
   const std::int64_t rigid = rows_of_array(contact_rigid);
   const T* const numbers = reals(contact_rigid, rigid, rigid_numbers, "masses of colliders");
   plan.rigid = rigid > 0 ? numbers : nullptr;
@@ -151,7 +152,7 @@ ContactOutputs contact_step_typed(const StepTensors& t, const Tensor& poses, at:
   call.info = t.info.mutable_data_ptr<double>();
 
   ContactCall<T> of;
-  of.plan = contact_plan_view<T>(contact, call.plan.vertices, place);
+  of.plan = contact_plan_view<T>(contact, call.batch, call.plan.vertices, place);
   const std::int64_t b = call.batch, c = of.plan.colliders, m = of.plan.capacity;
   const at::ScalarType real = scalar_type<T>;
   const auto check = [&](const Tensor& tensor, at::ScalarType type, at::IntArrayRef shape,

@@ -22,13 +22,16 @@ struct ContactPlan {
   // [body_vertices, 3] about the middle of the surface of each body; [bodies] least distance of parts of a solid that share
   // no vertex, or 0
   const T *rest, *rest_apart;
-  const T *local, *cell, *friction;  // [vertices, 3] of colliders; [vertices]; [bodies, bodies]
+  const T *local, *cell;  // [vertices, 3] of colliders; [vertices]
+  const T* friction;      // [bodies, bodies], or one table for each environment
   // [batch, colliders, 13] m / h^2, centre of mass, moment of inertia over h^2 (xx xy xz yy yz zz) and angular momentum over
   // h, about that centre in world axes; 0 for colliders without a mass; null if none has
   const T* rigid = nullptr;
   int vertices = 0, body_vertices = 0, triangles = 0, edges = 0, points = 0, bodies = 0,
       colliders = 0, capacity = 0, clusters = 0, point_clusters = 0, edge_clusters = 0;
   std::int64_t rest_pairs = 0;
+  std::int64_t friction_stride =
+      0;  // from the friction of an environment to that of the next; 0: all have one
   T thickness = 0;
   bool can_be_free = false;  // whether all bodies that may meet themselves have `rest_apart`
 };

@@ -187,14 +187,15 @@ class Simulator(Stepper):
             return _restored(saved)
 
     def _saved(self) -> SavedSimulation:
-        material = named_arrays(self)
+        material, contact = named_arrays(self), self._contact_tensors()
         return SavedSimulation(
             scene=self.scene,
             settings={name: getattr(self, name) for name in _SETTINGS},
             named_iterations=self.named_iterations,
             choice=self.choice,
             material=material,
-            trained=[name for name, value in material.items() if value.requires_grad],
+            contact=contact,
+            trained=[name for name, value in (material | contact).items() if value.requires_grad],
             reference=stored_reference(self.plan.arrays) if has_preconditioner(self.plan.arrays) else None,
         )
 
@@ -215,6 +216,8 @@ def _restored(saved: SavedSimulation) -> Simulator:
     flat = "rest_curvature" not in sim.material_names and not bool(saved.material.get("rest_curvature", _NONE).any())
     left_out = {"rest_curvature"} if flat else set()
     sim.set_material(**{name: array for name, array in saved.material.items() if name not in left_out})
+    for name, value in saved.contact.items():
+        setattr(sim, name, value)
     for name in set(saved.trained) - left_out:
         getattr(sim, name).requires_grad_()
     reference = saved.reference

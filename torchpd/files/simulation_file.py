@@ -83,6 +83,7 @@ class SavedSimulation:
     named_iterations: bool
     choice: Choice | None  # of solver="auto", which chooses again on another device
     material: dict[str, Tensor]  # arguments of `set_material` by name
+    contact: dict[str, Tensor]  # friction and thickness of `Contact` by name
     trained: list[str]  # names of arrays that require a gradient
     reference: tuple[Tensor, Tensor] | None  # stiffness and inertia for which a preconditioner was made
 
@@ -103,6 +104,7 @@ def save_simulation(saved: SavedSimulation, path: str | Path) -> None:
     for number, part in enumerate(scene.parts):
         tensors.update(_tensors(f"part.{number}", _part_arrays(part)))
     tensors.update({f"material.{name}": value.detach().cpu().contiguous() for name, value in saved.material.items()})
+    tensors.update({name: value.detach().cpu().contiguous() for name, value in saved.contact.items()})
     if saved.reference is not None:
         reference = zip(_REFERENCE, saved.reference, strict=True)
         tensors.update({f"solver.{name}": value.cpu().contiguous() for name, value in reference})
@@ -118,6 +120,7 @@ def save_simulation(saved: SavedSimulation, path: str | Path) -> None:
         "meshes": [{"flipped": mesh.flipped} for mesh in meshes],
         "parts": [_part_record(part, scene, meshes) for part in scene.parts],
         "material": list(saved.material),
+        "contact": list(saved.contact),
         "trained": saved.trained,
     }
     save_file(tensors, target, metadata={_KEY: json.dumps(record)})
@@ -294,6 +297,7 @@ def _saved(record: Record, tensors: _Tensors) -> SavedSimulation:
         named_iterations=record.get("named_iterations", True),  # absent in older files
         choice=Choice(**choice) if choice else None,
         material=material,
+        contact={name: tensors[name] for name in record.get("contact", ())},  # absent in older files
         trained=record["trained"],
         reference=reference,
     )

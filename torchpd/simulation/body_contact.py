@@ -60,52 +60,48 @@ class BodyContact:
         """The same elsewhere, or in another precision, whose rounding must be below the thickness."""
         return BodyContact._made(self.plan, dtype, device)
 
-    @property
-    def friction(self) -> Tensor:
-        """Coulomb's coefficient between bodies [Q, Q]: those of the scene in its order, then colliders."""
-        return self.arrays[CONTACT_FRICTION]
+    def tensors(self) -> dict[str, Tensor]:
+        """Friction and thickness of the scene, as a simulator holds them."""
+        return {
+            "contact_friction": self.arrays[CONTACT_FRICTION].clone(),
+            "contact_thickness": self.arrays[CONTACT_THICKNESS].clone(),
+        }
 
-    def with_friction(self, friction: Tensor | float) -> BodyContact:
-        """The same with other coefficients, [] for all pairs or [Q, Q], through which gradients flow."""
-        old = self.friction
-        given = torch.as_tensor(friction, dtype=old.dtype, device=old.device)
-        fix = "set the values of sim.contact_friction, or a number for all pairs"
-        if given.shape not in ((), old.shape):
-            raise ValueError(f"contact_friction must be [] or {list(old.shape)}, got {list(given.shape)}; {fix}")
-        table = given.expand(old.shape).contiguous()
-        values = table.detach().double().cpu().numpy()
-        if not (np.isfinite(values).all() and (values >= 0.0).all()):
-            raise ValueError(f"contact_friction must be finite and >= 0, got {values.min():.6g} to {values.max():.6g}")
-        if not np.array_equal(values, values.T):
-            raise ValueError(f"contact_friction must be the same for (a, b) and (b, a), got another; {fix}")
-        arrays = list(self.arrays)
-        arrays[CONTACT_FRICTION] = table
-        return replace(self, plan=replace(self.plan, friction=values.copy()), arrays=arrays)
-
-    @property
-    def thickness(self) -> Tensor:
-        """Distance at which surfaces meet [m], [1] on the CPU."""
-        return self.arrays[CONTACT_THICKNESS]
-
-    def with_thickness(self, thickness: Tensor | float, values: SceneValues) -> BodyContact:
-        """The same with another thickness, [] or [1], through which gradients flow. `values`: those of the scene."""
-        given = torch.as_tensor(thickness)
-        if given.numel() != 1:
+    def checked_friction(self, given: Any) -> Tensor:
+        """What `sim.contact_friction` may be set to, as a tensor; the one that was given if it is one already."""
+        bodies, like = len(self.plan.friction), self.arrays[CONTACT_FRICTION]
+        value = _real("contact_friction", given, like.dtype, like.device)
+        shapes = f"[], [{bodies}, {bodies}], [B, 1, 1] or [B, {bodies}, {bodies}]"
+        if value.dim() == 1 or value.dim() > 3 or value.shape[-2:] not in ((), (1, 1), (bodies, bodies)):
             raise ValueError(
-                f"contact_thickness must be one number for all surfaces, got a tensor {list(given.shape)}; set a float "
+                f"contact_friction must be {shapes} of the {bodies} bodies and colliders, got {list(value.shape)}"
+            )
+        if value.device.type == "meta":
+            return value
+        if not bool((value.detach().isfinite() & (value.detach() >= 0.0)).all()):
+            low, high = value.detach().aminmax()
+            raise ValueError(f"contact_friction must be finite and >= 0, got {float(low):.6g} to {float(high):.6g}")
+        if value.dim() and not torch.equal(value, value.mT):
+            raise ValueError(
+                "contact_friction must be the same for (a, b) and (b, a), got another; give table + table.mT"
+            )
+        return value
+
+    def with_thickness(self, given: Any, values: SceneValues) -> tuple[BodyContact, Tensor]:
+        """The same with what `sim.contact_thickness` is set to, and that as a tensor. `values`: those of the scene."""
+        value = _real("contact_thickness", given, self.arrays[CONTACT_FRICTION].dtype, torch.device("cpu"))
+        if value.numel() != 1:
+            raise ValueError(
+                f"contact_thickness must be one number for all surfaces, got a tensor {list(value.shape)}; set a float "
                 "or a tensor []"
             )
-        number = check_scalar("contact_thickness", float(given.detach()))
+        number = check_scalar("contact_thickness", float(value.detach()))
         if number <= 0.0:
             raise ValueError(f"contact_thickness must be positive [m], got {number}")
         assert values.contact is not None
         own = replace(values.contact, thickness=number, capacity=self.plan.capacity)
-        plan = replace(contact_plan(replace(values, contact=own)), friction=self.plan.friction)
-        made = BodyContact._made(plan, self.friction.dtype, self.friction.device)
-        arrays = list(made.arrays)
-        arrays[CONTACT_FRICTION] = self.friction
-        arrays[CONTACT_THICKNESS] = given.reshape(1).to(arrays[CONTACT_THICKNESS])
-        return replace(made, arrays=arrays)
+        like = self.arrays[CONTACT_FRICTION]
+        return BodyContact._made(contact_plan(replace(values, contact=own)), like.dtype, like.device), value
 
     @staticmethod
     def _made(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> BodyContact:
@@ -145,6 +141,8 @@ class BodyContact:
         state: State | HistoryState,
         forces: Tensor | None,
         given: Tensor | None,
+        friction: Tensor,
+        thickness: Tensor,
         inputs: ColliderInputs,
         material: list[Tensor],
         plan: list[Tensor],
@@ -156,6 +154,8 @@ class BodyContact:
             state: a checked one, whose flow is in the material.
             forces: on the vertices [B, V, 3] N.
             given: first iterate, which is refused.
+            friction: [], [Q, Q], [B, 1, 1] or [B, Q, Q].
+            thickness: [] or [1] m, on the CPU.
             inputs: what moves colliders.
             material: in the order of the ops.
             plan: arrays of the compiled scene.
@@ -170,14 +170,16 @@ class BodyContact:
         before = widened(ContactHistory(*state[2]), self.plan.capacity)  # type: ignore[misc]
         history = [before.poses.contiguous(), before.keys.contiguous(), before.forces.detach().contiguous()]
         wanted, time_step = history[0] if inputs.poses is None else inputs.poses.contiguous(), settings["time_step"]
-        arrays, motion, rigid = self.arrays, before.motion, self.rigid
+        arrays, motion, rigid = list(self.arrays), before.motion, self.rigid
+        bodies = len(self.plan.friction)
+        arrays[CONTACT_FRICTION] = friction.expand(*friction.shape[:-2], bodies, bodies).contiguous()
+        arrays[CONTACT_THICKNESS] = thickness.reshape(1)
         if rigid is not None:
             gravity = named_material(material)["gravity"]
             goal, rates, masses = _ops.free_motion(
                 history[0], motion, inputs.wrenches, gravity.unsqueeze(-2), rigid.numbers, time_step=time_step
             )
             wanted = torch.where(rigid.is_rigid, goal, wanted)
-            arrays = list(arrays)
             arrays[CONTACT_RIGID] = masses.flatten(0, 1)
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
             state[0], state[1], forces, wanted, history, material, plan, arrays, **settings
@@ -199,12 +201,11 @@ class BodyContact:
         rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back], dim=1)
         return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, motion, flow)), rows
 
-    @property
-    def surfaces(self) -> ContactSurfaces:
-        """What forces between surfaces are read by."""
+    def surfaces(self, thickness: Tensor) -> ContactSurfaces:
+        """What forces between surfaces are read by, with the present thickness [] or [1] m."""
         triangles, edges, _, body, collider = self.arrays[1:6]
-        points, cell, _, _, thickness = self.arrays[14:]
-        return ContactSurfaces(triangles, edges, body, collider, points, cell, thickness.to(points.device))
+        points, cell = self.arrays[14:16]
+        return ContactSurfaces(triangles, edges, body, collider, points, cell, thickness.detach().to(points))
 
     @staticmethod
     def check_transforms(*given: Tensor) -> None:
@@ -260,6 +261,21 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     moved = [array.to(device) for array in (*map(whole, [*surfaces, *search]), keys, *map(real, reals))]
     return [sizes, *moved, real([plan.thickness])]
+
+
+def _real(name: str, given: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A number or a tensor in this precision and on this device; what is trained must have both, and stays itself."""
+    try:
+        tensor = torch.as_tensor(given)
+        value = tensor.to(dtype=dtype, device=device)
+    except (TypeError, ValueError, RuntimeError):
+        raise TypeError(f"{name} must be a number or a tensor, got {given!r}") from None
+    if value is not tensor and tensor.requires_grad:
+        raise TypeError(
+            f"{name} must be {dtype} on {device} to be trained, got {tensor.dtype} on {tensor.device}; make it so before "
+            "requires_grad_(), since a converted copy would not follow the optimiser"
+        )
+    return value
 
 
 def _rigid_bodies(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> RigidBodies | None:

@@ -32,8 +32,9 @@ from .state_checks import check_time_step, check_tolerance
 if TYPE_CHECKING:
     from .body_contact import BodyContact
 
-__all__ = ["Configured"]
+__all__ = ["CONTACT_TENSORS", "Configured"]
 
+CONTACT_TENSORS = ("contact_friction", "contact_thickness")
 _PIN_STIFFNESS = CORE_ROWS.index("pin_stiffness")
 
 
@@ -46,6 +47,8 @@ class Configured(Planned, nn.Module):
     anchors: Anchors
     pin_hard: Tensor
     body_contact: BodyContact | None = None  # None without `Contact`
+    contact_friction: Tensor  # of scenes with `Contact`, as the next: see `Simulator`
+    contact_thickness: Tensor  # on the CPU
     progress: bool = True  # whether bars show while a large scene compiles, for another device too
     _batch: int | None
     _kernel: str
@@ -139,46 +142,15 @@ class Configured(Planned, nn.Module):
     def adjoint(self, adjoint: str) -> None:
         self._reconfigure(adjoint=adjoint)
 
-    @property
-    def contact_friction(self) -> Tensor:
-        """Coulomb's coefficient between bodies of `Contact` [Q, Q]: those of the scene in its order, then colliders.
-
-        Set a number, or a symmetric table; gradients of later steps flow to what was set. A table of its own for each
-        environment is not provided.
-
-        Example:
-            >>> friction = torch.tensor(0.3, requires_grad=True)
-            >>> sim.contact_friction = friction
-            >>> sim(state).positions.sum().backward()
-        """
-        return self._contact("contact_friction").friction
-
-    @contact_friction.setter
-    def contact_friction(self, friction: Tensor | float) -> None:
-        self.body_contact = self._contact("contact_friction").with_friction(friction)
-
-    @property
-    def contact_thickness(self) -> Tensor:
-        """Distance at which the surfaces of `Contact` meet [m], [1] on the CPU.
-
-        Set a number, or a tensor [] or [1]; gradients of later steps flow to it. Pairs of a body with itself that are
-        nearer at rest keep half of their distance. Setting it looks for those anew, on the host.
-
-        Example:
-            >>> thickness = torch.tensor(1e-3, requires_grad=True)
-            >>> sim.contact_thickness = thickness
-            >>> sim(state).positions.sum().backward()
-        """
-        return self._contact("contact_thickness").thickness
-
-    @contact_thickness.setter
-    def contact_thickness(self, thickness: Tensor | float) -> None:
-        self.body_contact = self._contact("contact_thickness").with_thickness(thickness, self.scene.values())
-
-    def _contact(self, name: str) -> BodyContact:
-        if self.body_contact is None:
-            raise ValueError(f"{name}: the scene must have a Contact, got none; add Contact()")
-        return self.body_contact
+    def __setattr__(self, name: str, value: Any) -> None:
+        """As `torch.nn.Module`; what `Contact` reads is checked, and may be a number."""
+        if name in CONTACT_TENSORS and (contact := self.body_contact) is not None:
+            if name == "contact_friction":
+                checked = contact.checked_friction(value)
+            else:
+                self.body_contact, checked = contact.with_thickness(value, self.scene.values())
+            value = checked
+        super().__setattr__(name, value)
 
     @property
     def compiled(self) -> Configuration:

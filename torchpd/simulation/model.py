@@ -22,7 +22,7 @@ from ..scene.pins import PIN_HARD
 from ..scene.scene import Scene
 from ..scene.solvers import DEFAULT_ITERATIONS, Chebyshev, Solver, SolverName, check_solver
 from ..scene.targets import Anchors, Targets
-from .configured import Configured
+from .configured import CONTACT_TENSORS, Configured
 from .load_checks import warn_of_loads
 from .material_update import (
     check_change,
@@ -130,6 +130,8 @@ class Model(Configured):
                 from .body_contact import BodyContact  # scenes without contact load nothing of it
 
                 self.body_contact = BodyContact.of(values, dtype)
+                for name, value in self.body_contact.tensors().items():
+                    self.register_buffer(name, value)
             self.plan: Plan = compile_plan(values, dtype=dtype, progress=progress)
             self.register_buffer("rest_positions", torch.tensor(values.rest_positions, dtype=dtype), persistent=False)
             contraction = self.anchors.contraction
@@ -222,8 +224,19 @@ class Model(Configured):
         return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        own = self._contact_tensors()
+        for name in [name for name in own if prefix + name in state_dict]:
+            # a checked one of another shape; torch copies the values of all
+            if state_dict[prefix + name].shape != own[name].shape:
+                setattr(self, name, state_dict[prefix + name].clone())
         load_material(self, state_dict, prefix, rest, self._replace_material, super()._load_from_state_dict)
+        for name, value in self._contact_tensors().items():
+            setattr(self, name, value)  # checks it, and finds which pairs are closer than the thickness at rest
         self._refresh_pin_mask()
+
+    def _contact_tensors(self) -> dict[str, Tensor]:
+        """What is trained of `Contact`, by name."""
+        return {} if self.body_contact is None else {name: getattr(self, name) for name in CONTACT_TENSORS}
 
     def check_state(self, state: State | HistoryState, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
         """Check a state and forces; return the forces of every environment.
@@ -306,10 +319,16 @@ class Model(Configured):
                 new = moved(reconfigure(self.compiled, solver=Chebyshev()), wanted.dtype, wanted.device)
             else:
                 new = moved(self.compiled, wanted.dtype, wanted.device)
+            thickness = None if contact is None else self.contact_thickness
+            number = None if thickness is None else thickness.data
             super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
             self._take(new)
-            if contact is not None:
-                self.body_contact = contact
+            if contact is not None and thickness is not None and number is not None:
+                self.body_contact = contact  # whose thickness stays on the host
+                if isinstance(thickness, nn.Parameter):
+                    thickness.data = number.to(wanted.dtype)
+                else:
+                    self._buffers["contact_thickness"] = thickness.to(wanted.dtype)
             if self.loads is not None:
                 self.loads = SurfaceLoads.of(self.scene, wanted.dtype, wanted.device)
             if loses_positions:

@@ -144,7 +144,7 @@ class Readable(Model):
                 "got positions alone; give the state that the step returned"
             )
         history = ContactHistory(*after[2])  # type: ignore[misc]
-        return pair_forces(self.body_contact.surfaces, after[0], history)
+        return pair_forces(self.body_contact.surfaces(self.contact_thickness), after[0], history)
 
     def reactions(
         self,

@@ -87,11 +87,12 @@ class Stepper(Readable):
             if contact.plan.grows:
                 contact.check_eager("Simulator")
                 contact = contact.with_capacity(max(contact.plan.capacity, state[2][1].shape[-1]))  # type: ignore[misc]
-            after, rows = contact.step(state, forces, given, inputs, material, plan, settings)
+            taken = state, forces, given, self.contact_friction, self.contact_thickness, inputs, material, plan, settings
+            after, rows = contact.step(*taken)
             while contact.plan.grows and (missing := _missing_pairs(rows)):
                 contact = contact.with_capacity(contact.plan.capacity + max(contact.plan.capacity, missing))
                 self._notices.after_growth(self, contact.plan.capacity)
-                after, rows = contact.step(state, forces, given, inputs, material, plan, settings)
+                after, rows = contact.step(*taken)
             self.body_contact = contact
             self._notices.after_contact(self, after[0], rows)
         if report and not torch.compiler.is_compiling():

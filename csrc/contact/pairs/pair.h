@@ -133,9 +133,11 @@ PD_HD std::int64_t find_sorted(const std::int64_t* numbers, std::int64_t count,
   return begin;
 }
 
-// Fills in thickness and friction; returns whether the pair counts. `held(vertex)`: moves by hand.
+// Fills in thickness and friction; returns whether the pair counts. `friction`: [bodies, bodies]; `held(vertex)`: moves by
+// hand.
 template <class T, class Held>
-PD_HD bool complete(const ContactPlan<T>& plan, const Held& held, ContactPair<T>& pair) {
+PD_HD bool complete(const ContactPlan<T>& plan, const T* friction, const Held& held,
+                    ContactPair<T>& pair) {
   const int* v = pair.vertex;
   const int split = pair.edges ? 2 : 1;
   for (int a = 0; a < split; ++a) {
@@ -150,7 +152,7 @@ PD_HD bool complete(const ContactPlan<T>& plan, const Held& held, ContactPair<T>
   if (at < plan.rest_pairs && plan.rest_key[at] == pair.key)
     pair.thickness = plan.rest_thickness[at];
   if (!(pair.thickness > T(0))) return false;  // a tie joins the sides, of one body or of two
-  pair.friction = plan.friction[std::int64_t(first) * plan.bodies + last];
+  pair.friction = friction[std::int64_t(first) * plan.bodies + last];
   return true;
 }
 

@@ -60,7 +60,8 @@ class ContactStepper : public Stepper<Single<T>, HasContacts> {
              contact.history.keys + e_ * contact.plan.capacity,
              contact.history.forces + 4 * e_ * contact.plan.capacity,
              contact.plan.rigid +
-                 (contact.plan.rigid ? rigid_numbers * e_ * contact.plan.colliders : 0)},
+                 (contact.plan.rigid ? rigid_numbers * e_ * contact.plan.colliders : 0),
+             contact.plan.friction + e_ * contact.plan.friction_stride},
         steps_(env_) {}
 
   void rollout() {

@@ -125,7 +125,8 @@ PD_DEVICE ContactEnvironment<T> environment_of(const ContactKernel<T>& call,
           w.contact.poses + e * plan.colliders * 7,
           w.contact.history.keys + e * plan.capacity,
           w.contact.history.forces + 4 * e * plan.capacity,
-          plan.rigid + (plan.rigid ? rigid_numbers * e * plan.colliders : 0)};
+          plan.rigid + (plan.rigid ? rigid_numbers * e * plan.colliders : 0),
+          plan.friction + e * plan.friction_stride};
 }
 
 template <class T, class Steps>

@@ -286,7 +286,8 @@ class AdjointPairs {
       weights[a] = rigid_yield / own.at.weight();
     }
     for (; slots < most_slots; ++slots) item.node[slots] = item.moves[slots] = -1;
-    item.pair = loaded_pair(edges, after, before, weights, double(plan_.friction[item.bodies]),
+    const T* const friction = plan_.friction + environment_ * plan_.friction_stride;
+    item.pair = loaded_pair(edges, after, before, weights, double(friction[item.bodies]),
                             double(f[0]), Place{double(f[1]), double(f[2]), double(f[3])});
     item.slopes.set(item.pair, after, before);
   }

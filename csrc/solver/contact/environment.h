@@ -347,6 +347,7 @@ struct ContactEnvironment {
   const std::int64_t* history_key;  // [capacity]
   const T* history_force;           // [capacity, 4]
   const T* rigid;                   // [colliders, 13] as in ContactPlan
+  const T* friction;                // [bodies, bodies]
 
   PD_HD bool held(int v) const { return a.held[v] != 0; }
   // components that move rigidly: those of bodies, then colliders if one has a mass

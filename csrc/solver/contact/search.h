@@ -105,7 +105,7 @@ class ContactSearch {
   // Whether the pair counts.
   PD_HD bool find_pair(int owner, int other, ContactPair<T>& pair) const {
     pair = sides_of(owner, other);
-    return complete(env_.plan, [&](int v) { return env_.held(v); }, pair);
+    return complete(env_.plan, env_.friction, [&](int v) { return env_.held(v); }, pair);
   }
 
   // A list of what came near, as far as there is room; `value`: of the caller
