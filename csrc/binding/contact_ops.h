@@ -122,6 +122,8 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t batch,
   check_array(arrays[contact_thickness], scalar_type<T>, 1, 1, {at::kCPU, "every plan's thickness"},
               "contact", "thickness [m]");
   plan.thickness = *arrays[contact_thickness].const_data_ptr<T>();
+  TORCH_CHECK_VALUE(plan.thickness > 0, "contact_thickness must be positive [m], got ",
+                    plan.thickness);
   return plan;
 }
 

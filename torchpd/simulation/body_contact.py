@@ -71,6 +71,8 @@ class BodyContact:
         """What `sim.contact_friction` may be set to, as a tensor; the one that was given if it is one already."""
         bodies, like = len(self.plan.friction), self.arrays[CONTACT_FRICTION]
         value = _real("contact_friction", given, like.dtype, like.device)
+        if not isinstance(given, Tensor) and value.dim() == 0:
+            value = value.expand(bodies, bodies).clone()
         shapes = f"[], [{bodies}, {bodies}], [B, 1, 1] or [B, {bodies}, {bodies}]"
         if value.dim() == 1 or value.dim() > 3 or value.shape[-2:] not in ((), (1, 1), (bodies, bodies)):
             raise ValueError(
@@ -266,14 +268,14 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
 def _real(name: str, given: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     """A number or a tensor in this precision and on this device; what is trained must have both, and stays itself."""
     try:
-        tensor = torch.as_tensor(given)
+        tensor = given if isinstance(given, Tensor) else torch.as_tensor(given, dtype=dtype)
         value = tensor.to(dtype=dtype, device=device)
     except (TypeError, ValueError, RuntimeError):
         raise TypeError(f"{name} must be a number or a tensor, got {given!r}") from None
     if value is not tensor and tensor.requires_grad:
         raise TypeError(
-            f"{name} must be {dtype} on {device} to be trained, got {tensor.dtype} on {tensor.device}; make it so before "
-            "requires_grad_(), since a converted copy would not follow the optimiser"
+            f"{name} must be {dtype} on {device} to be trained, got {tensor.dtype} on {tensor.device}; make it so "
+            "before requires_grad_(), since a converted copy would not follow the optimiser"
         )
     return value
 

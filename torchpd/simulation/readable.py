@@ -190,18 +190,26 @@ class Readable(Model):
         return stress(self.scene, positions, rows)
 
     def check(self, state: State | HistoryState) -> None:
-        """Refuse a state that no step takes: its shapes, and surfaces of `Contact` that cross or touch.
+        """Refuse a state that no step takes: its shapes, numbers, and surfaces of `Contact` that cross or touch.
 
-        A step checks no positions. What a simulator returns is free of crossings; check states of your own once.
+        A step checks no values. What a simulator returns is free of crossings; check states of your own once.
 
         Args:
             state: as in `forward`.
 
         Raises:
-            ValueError: names the environment, and the edge and triangle that cross, or the sides that touch.
+            ValueError: names the environment, and what is not finite, the edge and triangle that cross, or the sides
+                that touch.
         """
         self.check_state(state)
         self.positions_of(state)
+        for name, values in (("positions", state[0]), ("velocities", state[1])):
+            bad = (~values.isfinite()).flatten(1).sum(1)
+            if bool(bad.any()):
+                first = int(bad.nonzero()[0])
+                raise ValueError(
+                    f"check: {name} must be finite, got {int(bad[first])} numbers that are not in environment {first}"
+                )
         if self.body_contact is not None:
             self.body_contact.check(state)
 

@@ -287,7 +287,7 @@ class Info(NamedTuple):
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 10]; files without `inverted` have 6 columns."""
+        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 10]; older files have 6 columns."""
         residual, energy, _, _, converged, rho, *counted = rows.unbind(-1)
         # one pass for all columns; what it makes of those that are no whole numbers is not read
         _, _, iterations, restarts, _, _, *whole = rows.long().unbind(-1)

@@ -87,7 +87,17 @@ class Stepper(Readable):
             if contact.plan.grows:
                 contact.check_eager("Simulator")
                 contact = contact.with_capacity(max(contact.plan.capacity, state[2][1].shape[-1]))  # type: ignore[misc]
-            taken = state, forces, given, self.contact_friction, self.contact_thickness, inputs, material, plan, settings
+            taken = (
+                state,
+                forces,
+                given,
+                self.contact_friction,
+                self.contact_thickness,
+                inputs,
+                material,
+                plan,
+                settings,
+            )
             after, rows = contact.step(*taken)
             while contact.plan.grows and (missing := _missing_pairs(rows)):
                 contact = contact.with_capacity(contact.plan.capacity + max(contact.plan.capacity, missing))

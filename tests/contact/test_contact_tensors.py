@@ -1,0 +1,150 @@
+"""Friction and thickness of `Contact` as tensors of the module: set once, trained, saved, of each environment."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from body_scenes import slope
+from torch import Tensor, nn
+from torch.func import functional_call
+
+import torchpd as pd
+
+
+def sliding(dtype: torch.dtype = torch.float64) -> tuple[pd.Simulator, Any]:
+    """A cube that slides on a rigid plane, three steps after it has begun to."""
+    course = slope(0.0, 0.4, speed=2.0)
+    sim = pd.Simulator(course.scene, iterations=64, dtype=dtype)
+    state: Any = course.start(sim)
+    for _ in range(3):
+        state = sim(state)
+    return sim, state
+
+
+def way(sim: pd.Simulator, state: Any, steps: int = 3) -> Tensor:
+    """Mean way in the direction of the slide [B]."""
+    after = state
+    for _ in range(steps):
+        after = sim(after)
+    return (after.positions - state.positions)[..., 0].mean(dim=1)
+
+
+@pytest.mark.parametrize("table", [False, True])
+@pytest.mark.parametrize("kind", ["leaf", "parameter"])
+def test_what_is_set_once_follows_its_optimiser(kind: str, table: bool) -> None:
+    sim, state = sliding()
+    shape = sim.contact_friction.shape if table else ()
+    given = torch.full(shape, 0.2, dtype=torch.float64)
+    sim.contact_friction = friction = nn.Parameter(given) if kind == "parameter" else given.requires_grad_()
+    assert sim.contact_friction is friction
+    assert any(one is friction for one in sim.parameters()) == (kind == "parameter")
+    found = []
+    for _ in range(2):
+        (gradient,) = torch.autograd.grad(way(sim, state).sum(), friction)
+        found.append(float(gradient.sum()))
+        with torch.no_grad():
+            friction += 0.3
+    assert found[0] == pytest.approx(found[1], rel=0.1)  # -h^2 g k (k + 1) / 2 of both
+    other, _ = sliding()
+    other.contact_friction = float(friction.detach().max())
+    assert torch.equal(way(sim, state), way(other, state))
+
+
+def test_a_call_may_have_its_own() -> None:
+    sim, state = sliding()
+    own = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
+    after: Any = functional_call(sim, {"contact_friction": own}, (state,))
+    slow: Any = sim(state)
+    assert after.positions[..., 0].mean() > slow.positions[..., 0].mean()
+    assert torch.autograd.grad(after.positions[..., 0].mean(), own)[0] < 0.0
+
+
+def test_of_each_environment() -> None:
+    """Bits of each alone, and gradients of each alone."""
+    sim, state = sliding()
+    values = [0.1, 0.3, 0.7]
+    sim.contact_friction = friction = torch.tensor(values, dtype=torch.float64)[:, None, None].requires_grad_()
+    many = pd.HistoryState(
+        *(array.expand(3, *array.shape[1:]).clone() for array in state[:2]),
+        pd.ContactHistory(*(array.expand(3, *array.shape[1:]).clone() for array in state.history)),
+    )
+    together = way(sim, many)
+    assert together[0] > together[1] > together[2]
+    (gradient,) = torch.autograd.grad(together.sum(), friction)
+    for number, value in enumerate(values):
+        sim.contact_friction = own = torch.tensor(value, dtype=torch.float64, requires_grad=True)
+        alone = way(sim, state)
+        assert torch.equal(alone[0], together[number])
+        assert torch.equal(torch.autograd.grad(alone.sum(), own)[0], gradient[number].sum())
+    sim.contact_friction = torch.ones(2, 1, 1, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"contact_friction must be \[2, 2\] or \[3, 2, 2\].* got .*\[2, 2, 2\]"):
+        sim(many)
+
+
+@pytest.mark.parametrize("how", ["file", "state_dict", "copy"])
+def test_they_are_kept(how: str, tmp_path: Path) -> None:
+    sim, state = sliding()
+    sim.contact_friction, sim.contact_thickness = torch.tensor(0.1, dtype=torch.float64), 1.1e-3
+    if how == "file":
+        sim.save(tmp_path / "sim")
+        other = pd.Simulator.load(tmp_path / "sim")
+    elif how == "state_dict":
+        other, _ = sliding()
+        other.load_state_dict(sim.state_dict())
+    else:
+        sim.contact_friction = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
+        other = copy.deepcopy(sim)
+    assert float(other.contact_thickness) == 1.1e-3
+    assert other.body_contact is not None
+    assert other.body_contact.plan.thickness == 1.1e-3
+    assert torch.equal(way(other, state), way(sim, state))
+
+
+def test_another_precision_has_their_values() -> None:
+    sim, _ = sliding(torch.float32)
+    sim.contact_friction, sim.contact_thickness = 0.25, 1.5e-3
+    sim = sim.double()
+    assert sim.contact_friction.dtype == sim.contact_thickness.dtype == torch.float64
+    assert float(sim.contact_friction[0, 1]) == 0.25
+    assert float(sim.contact_thickness) == pytest.approx(1.5e-3, rel=1e-6)
+
+
+def test_no_optimiser_makes_the_thickness_negative() -> None:
+    sim, state = sliding()
+    sim.contact_thickness = thickness = torch.tensor(1e-3, dtype=torch.float64, requires_grad=True)
+    with torch.no_grad():
+        thickness -= 1.0
+    with pytest.raises(ValueError, match=r"contact_thickness must be positive .*got -0.999"):
+        sim(state)
+
+
+def test_trained_tensors_are_not_converted() -> None:
+    sim, _ = sliding()
+    with pytest.raises(
+        TypeError, match=r"contact_friction must be torch.float64 on cpu to be trained, got torch.float32"
+    ):
+        sim.contact_friction = torch.tensor(0.3, requires_grad=True)
+    with pytest.raises(TypeError, match="contact_friction must be a number or a tensor, got 'a'"):
+        sim.contact_friction = "a"  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize("what", [float("nan"), -1e5])
+def test_material_that_is_none_has_no_residual(what: float) -> None:
+    sim = pd.Simulator(slope(0.0, 0.4).scene)
+    stiffness = sim.stiffness.expand(2, -1).clone()
+    stiffness[1] = what
+    _, info = functional_call(sim, {"stiffness": stiffness}, (sim.rest_state(2),), {"return_info": True})
+    assert info.residual.isnan().tolist() == [False, True]
+
+
+def test_a_checked_state_is_finite() -> None:
+    sim, state = sliding()
+    state.velocities[0, 3] = float("nan")
+    with pytest.raises(
+        ValueError, match="check: velocities must be finite, got 3 numbers that are not in environment 0"
+    ):
+        sim.check(state)
