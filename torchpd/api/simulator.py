@@ -45,6 +45,11 @@ class Simulator(Stepper):
     The buffer `pin_hard` [P] or [B, P] says which pins hold exactly; change it to release and to grasp. `set_material`
     checks and replaces all of these. The rest shape is compiled and has no gradient.
 
+    A scene with `Contact` has the buffers `contact_friction` [Q, Q], of the bodies of the scene and then its colliders,
+    and `contact_thickness` [1] m, on the CPU. Set a number, a tensor or a `torch.nn.Parameter`: tensors are kept, so
+    that steps follow what an optimiser writes. Friction may also be [] or, for each environment, [B, 1, 1] or
+    [B, Q, Q]. Setting the thickness finds the pairs that are closer than it at rest.
+
     A step checks no values, because that would wait for a GPU. Where an optimiser or `torch.func.functional_call`
     brings NaN, or negative stiffness, masses or springs, `Info.residual` is NaN (`Info` names the exceptions). So let
     an optimiser learn the logarithm of positive quantities.
