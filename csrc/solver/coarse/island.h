@@ -73,6 +73,7 @@ struct PairTerms {
   double before, after, lag, radius;
   Vec3<double> arm[2], normal, force;
   double across, along;
+  int other[2];  // of sweeps: the collider with a mass on the other side, or -1
 
   // For the body of one side; energies count once, on the first side that moves.
   PD_HD ContactTerms<double> of_side(int s, bool counts) const {

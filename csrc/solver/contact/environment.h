@@ -36,11 +36,12 @@ namespace pd::inline PD_TARGET {
 // Numbers of an environment, one of each.
 struct ContactNumbers {
   double checked_energy;
+  double slope, least_slope;  // of the steps of colliders that pairs couple
   int pairs, known, most_pairs, searches, shortened, frozen;
   int searched_at;
   int waits, checked;
   // of an iteration
-  int active, outside, loaded, cut, stopped, meets, changed;
+  int active, outside, loaded, cut, stopped, meets, changed, couples;
   int listed;                                     // near pairs that were found, listed or not
   int corrects, searching, leaves, cuts, pushes;  // of a coarse correction
   int moved, changes[contact_sweeps];  // vertices of active pairs; whether sweeps change a force
@@ -125,9 +126,11 @@ struct RigidCollider {
   Vec3<double> at;
   double length;
   Vec3<double> pull, torque, shift, turn;
+  // of a step: the lower triangle of its matrix row by row, what it lacks to balance, the step, and conjugate gradients
+  double matrix[21], left[6], way[6], direction[6], product[6];
   double energy;
   // at the end of a step: squares of what is not balanced, of all, and of places and turns in N [N^2]
-  double left, whole, rounding;
+  double unbalanced, whole, rounding;
 };
 
 // Arrays of an environment. Vertices have the user's numbers, those of colliders last.

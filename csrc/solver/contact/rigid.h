@@ -8,8 +8,9 @@
 //   W / 2 |t|^2 + w . J w / 2 - W (c_goal - c) . t - torque . w,   torque = (1 + [u] / 2 + u u^T / 4) (L - J u).
 // What balances the torque takes that momentum: L_next = L - torque.
 // The prox of an iteration (solver/contact/prox.h) has t and w as six more unknowns, in this metric. So no momentum acts on
-// a collider: it is where its inertia and the forces of its pairs leave it. Each sweep solves for t and w first, with forces
-// of pairs that follow them by beta, until they are still: then these forces balance its inertia. Pairs then take the motion
+// a collider: it is where its inertia and the forces of its pairs leave it. Each sweep solves for t and w of all colliders first,
+// with forces of pairs that follow them by beta, until they are still: then these forces balance their inertia. A pair of
+// two colliders couples them: conjugate gradients solve Newton's steps of all at once, with the 6 x 6 matrices of each. Pairs then take the motion
 // of their corners for given. A pair whose surfaces are near is active where the free motion would bring them too near.
 #pragma once
 #include "solver/contact/environment.h"
@@ -20,6 +21,8 @@ namespace pd::inline PD_TARGET {
 
 // Newton's steps of a sweep: most take two. Four of eight are halves, as some cycle.
 constexpr int rigid_passes = 32;
+constexpr double joint_tolerance = 1e-8;  // of what a step of coupled colliders leaves
+constexpr int joint_rounds = 64;
 constexpr double rigid_near = 2;  // thicknesses within which the free motion makes pairs active
 
 PD_HD Pose<double> widened(const Pose<float>& a) {
@@ -167,24 +170,24 @@ class RigidColliders {
     carry(team, moved);
     bool goes = true;
     for (int pass = 0; goes && pass < rigid_passes; ++pass) {
-      team.spread(1, [&](int) { numbers.changed = 0; });
+      team.spread(1, [&](int) { numbers.changed = numbers.couples = 0; });
+      team.barrier();
       team.each(active, [&](int q) {
         if (a_.joins[rows_[q].pair()]) find_terms(rows_[q], first && pass == 0);
       });
       team.groups(plan_.colliders, [&](int c, const auto& group) {
-        if (a_.side_start[c] == a_.side_start[c + 1]) return;
+        if (!meets(c)) return;
         double sums[ContactSums::count] = {};
-        group.sum_range(
-            a_.side_start[c], a_.side_start[c + 1],
-            [&](int n, auto& sum) {
-              const int p = a_.side_pair[n];
-              add_terms(sum, a_.terms[p].of_side(side(a_.pair[p], 0) == c ? 0 : 1, false));
-            },
-            sums);
-        if (group.leads() && step(a_.rigid_collider[c], sums, (pass & 4) != 0 ? 0.5 : 1.0))
+        each_of_side(group, c, sums, [&](const PairTerms& of, int s, auto& sum) {
+          add_terms(sum, of.of_side(s, false));
+        });
+        if (group.leads()) linearise(a_.rigid_collider[c], sums);
+      });
+      if (numbers.couples) solve_jointly(team);
+      team.each(plan_.colliders, [&](int c) {
+        if (meets(c) && step(a_.rigid_collider[c], (pass & 4) != 0 ? 0.5 : 1.0))
           numbers.changed = 1;
       });
-      team.barrier();
       goes = numbers.changed != 0;
       carry(team, moved);
     }
@@ -197,9 +200,8 @@ class RigidColliders {
     team.each(plan_.colliders, [&](int c) {
       if (!is_rigid(c)) return;
       const RigidCollider& of = a_.rigid_collider[c];
-      const bool meets = some && a_.side_start[c] < a_.side_start[c + 1];
-      a_.hand[c].goal =
-          meets ? pd::moved(a_.hand[c].pose, of.center, of.shift, of.turn) : free_goal(c);
+      a_.hand[c].goal = some && meets(c) ? pd::moved(a_.hand[c].pose, of.center, of.shift, of.turn)
+                                         : free_goal(c);
     });
     each_vertex(team,
                 [&](int v, int c) { a_.target[v] = a_.hand[c].goal.place(local_point(plan_, v)); });
@@ -246,10 +248,11 @@ class RigidColliders {
       return dot(f, f) + of.length * of.length * dot(t, t);
     };
     const double turns = of.length * trace(of.inertia);
-    of.left = square(of.pull + force, of.torque + torque);
+    of.unbalanced = square(of.pull + force, of.torque + torque);
     of.whole = square(of.pull, of.torque) + square(force, torque);
     of.rounding = of.weight * of.weight * dot(at, at) + turns * turns;
-    step(of, sums, 1.0);
+    linearise(of, sums);
+    step(of, 1.0);
     return square_root(dot(of.shift, of.shift) + dot(of.turn, of.turn) / (of.length * of.length));
   }
 
@@ -260,7 +263,7 @@ class RigidColliders {
     for (int c = 0; exist() && c < plan_.colliders; ++c) {
       if (!is_rigid(c)) continue;
       const RigidCollider& of = a_.rigid_collider[c];
-      left += of.left, whole += of.whole, rounding += of.rounding;
+      left += of.unbalanced, whole += of.whole, rounding += of.rounding;
     }
     const double more =
         square_root(left) - report_roundings * double(epsilon<T>()) * square_root(rounding);
@@ -293,6 +296,21 @@ class RigidColliders {
       const int v = plan_.body_vertices + n, c = plan_.collider[v];
       if (is_rigid(c)) visit(v, c);
     });
+  }
+
+  // Whether it has pairs that are active.
+  PD_HD bool meets(int c) const { return a_.side_start[c] < a_.side_start[c + 1]; }
+
+  // Sums over its active pairs: add(terms, side, sum).
+  template <int Count, class Group, class Add>
+  PD_HD void each_of_side(const Group& group, int c, double (&sums)[Count], const Add& add) const {
+    group.sum_range(
+        a_.side_start[c], a_.side_start[c + 1],
+        [&](int n, auto& sum) {
+          const int p = a_.side_pair[n];
+          add(a_.terms[p], side(a_.pair[p], 0) == c ? 0 : 1, sum);
+        },
+        sums);
   }
 
   // -1: no collider with a mass
@@ -341,8 +359,6 @@ class RigidColliders {
         subtract_product(old.tangential, beta, tangential(between - before, normal)), normal);
     const T size = square_root(dot(pull, pull)), bound = friction * old.normal;
     const int p = row.pair();
-    // steps of two colliders at once, each with half of the pair
-    const double both = side(a_.pair[p], 0) >= 0 && side(a_.pair[p], 1) >= 0 ? 2.0 : 1.0;
     PairTerms& terms = a_.terms[p];
     terms.before = terms.after = terms.lag = terms.radius = 0;
     terms.normal = widened<double>(normal);
@@ -350,13 +366,15 @@ class RigidColliders {
                        ? multiply_add(beta, row[Row::thickness] - dot(normal, between), old.normal)
                        : next.normal;
     terms.force = widened<double>(multiply_add(held, normal, onto_disc(pull, bound)));
-    terms.along = guess || next.normal > T(0) ? both * double(beta) : 0.0;
-    terms.across =
-        bound > T(0) ? both * double(beta) * (size > bound ? double(bound / size) : 1.0) : 0.0;
+    terms.along = guess || next.normal > T(0) ? double(beta) : 0.0;
+    terms.across = bound > T(0) ? double(beta) * (size > bound ? double(bound / size) : 1.0) : 0.0;
+    const int c = side(a_.pair[p], 0), d = side(a_.pair[p], 1);
+    terms.other[0] = d, terms.other[1] = c;
+    if (c >= 0 && d >= 0 && terms.resists()) env_.numbers().couples = 1;
   }
 
-  // A share of a step toward the balance of inertia and forces. Returns whether it moves.
-  PD_HD bool step(RigidCollider& of, const double (&sum)[ContactSums::count], double share) const {
+  // Its matrix and what it lacks to balance, turns in lengths, and its step alone.
+  PD_HD void linearise(RigidCollider& of, const double (&sum)[ContactSums::count]) const {
     using S = ContactSums;
     const Vec3<double> force = subtract_product(of.pull, of.weight, of.shift),
                        torque = of.torque - of.inertia * of.turn;
@@ -364,25 +382,122 @@ class RigidColliders {
     const Mat3<double>& j = of.inertia;
     const double turns[6] = {j.row[0].x, j.row[1].x, j.row[1].y,
                              j.row[2].x, j.row[2].y, j.row[2].z};
-    double terms[27], way[6];
-    for (int r = 0; r <= 6; ++r) {
-      for (int c = 0; c <= r && c < 6; ++c) {
-        const double scale = (r < 3 || r == 6 ? 1.0 : of.length) * (c < 3 ? 1.0 : of.length);
-        const double inertia = r == 6  ? own[c]
-                               : r < 3 ? (r == c ? of.weight : 0.0)
+    for (int r = 0; r < 6; ++r) {
+      const double scale = r < 3 ? 1.0 : of.length;
+      of.left[r] = scale * (own[r] + sum[S::force + r]);
+      for (int c = 0; c <= r; ++c) {
+        const double inertia = r < 3   ? (r == c ? of.weight : 0.0)
                                : c < 3 ? 0.0
                                        : turns[(r - 3) * (r - 2) / 2 + c - 3];
-        terms[r * (r + 1) / 2 + c] =
-            scale * (inertia + (r == 6 ? sum[S::force + c] : sum[S::at(r, c)]));
+        of.matrix[r * (r + 1) / 2 + c] =
+            scale * (c < 3 ? 1.0 : of.length) * (inertia + sum[S::at(r, c)]);
       }
     }
+    solve_alone(of, of.way);
+  }
+
+  PD_HD static void solve_alone(const RigidCollider& of, double (&way)[6]) {
+    double terms[27];
+    for (int n = 0; n < 21; ++n) terms[n] = of.matrix[n];
+    for (int n = 0; n < 6; ++n) terms[21 + n] = of.left[n];
     solve_twist(terms, way);
+  }
+
+  // The step of all colliders, by conjugate gradients from their steps alone.
+  template <class Team>
+  PD_HD void solve_jointly(const Team& team) const {
+    ContactNumbers& numbers = env_.numbers();
+    team.once([&] {
+      double slope = 0;
+      each_meeting([&](RigidCollider& of) {
+        for (int n = 0; n < 6; ++n) {
+          slope = multiply_add(of.left[n], of.way[n], slope);
+          of.direction[n] = of.way[n];
+          of.way[n] = 0;
+        }
+      });
+      numbers.slope = slope;
+      numbers.least_slope = joint_tolerance * joint_tolerance * slope;
+    });
+    for (int round = 0; round < joint_rounds && numbers.slope > numbers.least_slope; ++round) {
+      team.groups(plan_.colliders, [&](int c, const auto& group) {
+        if (!meets(c)) return;
+        double sums[6] = {};
+        each_of_side(group, c, sums, [&](const PairTerms& of, int s, auto& sum) {
+          if (of.other[s] >= 0) add_coupling(of, s, sum);
+        });
+        if (group.leads()) multiply(a_.rigid_collider[c], sums);
+      });
+      team.once([&] { advance(numbers); });
+    }
+  }
+
+  template <class Visit>
+  PD_HD void each_meeting(const Visit& visit) const {
+    for (int c = 0; c < plan_.colliders; ++c)
+      if (meets(c)) visit(a_.rigid_collider[c]);
+  }
+
+  // The force on one side, and its torque, that follows the direction of the collider of the other.
+  PD_HD void add_coupling(const PairTerms& of, int s, double (&sum)[6]) const {
+    const RigidCollider& other = a_.rigid_collider[of.other[s]];
+    const double* const d = other.direction;
+    const Vec3<double> turn = other.length * Vec3<double>{d[3], d[4], d[5]},
+                       moved = Vec3<double>{d[0], d[1], d[2]} + cross(turn, of.arm[1 - s]);
+    const Vec3<double> force = multiply_add((of.along - of.across) * dot(of.normal, moved),
+                                            of.normal, of.across * moved),
+                       torque = cross(of.arm[s], force);
+    sum[0] += force.x, sum[1] += force.y, sum[2] += force.z;
+    sum[3] += torque.x, sum[4] += torque.y, sum[5] += torque.z;
+  }
+
+  // The product of the whole matrix and the direction.
+  PD_HD static void multiply(RigidCollider& of, const double (&coupling)[6]) {
+    for (int r = 0; r < 6; ++r) {
+      double sum = -(r < 3 ? 1.0 : of.length) * coupling[r];
+      for (int c = 0; c < 6; ++c)
+        sum = multiply_add(of.matrix[r > c ? r * (r + 1) / 2 + c : c * (c + 1) / 2 + r],
+                           of.direction[c], sum);
+      of.product[r] = sum;
+    }
+  }
+
+  PD_HD void advance(ContactNumbers& numbers) const {
+    double curvature = 0, slope = 0;
+    each_meeting([&](RigidCollider& of) {
+      for (int n = 0; n < 6; ++n)
+        curvature = multiply_add(of.direction[n], of.product[n], curvature);
+    });
+    if (!(curvature > 0)) return void(numbers.slope = 0);
+    const double length = numbers.slope / curvature;
+    each_meeting([&](RigidCollider& of) {
+      for (int n = 0; n < 6; ++n) {
+        of.way[n] = multiply_add(length, of.direction[n], of.way[n]);
+        of.left[n] = subtract_product(of.left[n], length, of.product[n]);
+      }
+      solve_alone(of, of.product);
+      for (int n = 0; n < 6; ++n) slope = multiply_add(of.left[n], of.product[n], slope);
+    });
+    const double keep = slope / numbers.slope;
+    each_meeting([&](RigidCollider& of) {
+      for (int n = 0; n < 6; ++n)
+        of.direction[n] = multiply_add(keep, of.direction[n], of.product[n]);
+    });
+    numbers.slope = slope;
+  }
+
+  // A share of its step toward the balance of inertia and forces. Returns whether it moves.
+  PD_HD bool step(RigidCollider& of, double share) const {
+    const double (&way)[6] = of.way;
     const Vec3<double> shift{way[0], way[1], way[2]}, turn{way[3], way[4], way[5]};
     of.shift = multiply_add(share, shift, of.shift);
     of.turn = multiply_add(share * of.length, turn, of.turn);
-    constexpr double still = sizeof(T) == 4 ? 1e-6 : 1e-10;
-    const double size = dot(of.shift, of.shift) + dot(of.turn, of.turn) / (of.length * of.length);
-    return dot(shift, shift) + dot(turn, turn) > still * still * size;
+    // places are no finer than their rounding
+    constexpr double still = sizeof(T) == 4 ? 1e-6 : 1e-10, fine = epsilon<T>();
+    const double arm = 1.0 / (of.length * of.length),
+                 size = dot(of.shift, of.shift) + arm * dot(of.turn, of.turn),
+                 least = still * still * size + fine * fine * (dot(of.at, of.at) + arm);
+    return dot(shift, shift) + dot(turn, turn) > least;
   }
 
   const Env& env_;
