@@ -107,14 +107,10 @@ PairTensors pair_gradients_typed(const SolvedAdjoint& s, at::TensorList pairs,
   call.projector = s.projector ? keep(*s.projector) : nullptr;
   call.sliding = s.sliding ? keep(*s.sliding) : nullptr;
   const auto made = [&](at::IntArrayRef shape) { return at::zeros(shape, s.multiplier.options()); };
-  const PairTensors out{made({b, vertices, 3}),
-                        made({b, vertices, 3}),
-                        made({b, c, 7}),
-                        made({b, c, 7}),
-                        made({b, q, q}),
-                        made({b}),
-                        made({b, c, 7}),
-                        made({b, masses, rigid_numbers})};
+  const PairTensors out{made({b, vertices, 3}), made({b, vertices, 3}),
+                        made({b, c, 7}),        made({b, c, 7}),
+                        made({b, q, q}),        made({b}),
+                        made({b, c, 7}),        made({b, masses, rigid_numbers})};
   call.out = {out.end.mutable_data_ptr<T>(),        out.start.mutable_data_ptr<T>(),
               out.poses_end.mutable_data_ptr<T>(),  out.poses_start.mutable_data_ptr<T>(),
               out.poses_free.mutable_data_ptr<T>(), out.rigid.mutable_data_ptr<T>(),
@@ -210,15 +206,19 @@ std::vector<Tensor> contact_step_vjp(const Tensor& grad_positions, const Tensor&
   if (masses)
     all.widen({contact[contact_rigid].view({b, c, rigid_numbers}), poses, history[1],
                at::where(back, 0.0, grad_poses), back.view({-1, 1})});
-  const AdjointTensors wide{grad_x, grad_v, all.after, all.positions, velocities, forces, material,
-                            all.plan};
+  const AdjointTensors wide{grad_x,     grad_v, all.after, all.positions,
+                            velocities, forces, material,  all.plan};
   const auto [solutions, error] = solve<Backend>(
       wide, {all.right, all.inertia, all.inverse, all.projector, all.sliding, pairs}, time_step);
   const Tensor solution = solutions.narrow(1, 0, vertices).contiguous();
   Tensor elastic = elastic_product(t, solution, time_step);
   const SolvedAdjoint solved{
-      all.right,   all.inertia, all.inverse,
-      all.projector, all.sliding, solutions,
+      all.right,
+      all.inertia,
+      all.inverse,
+      all.projector,
+      all.sliding,
+      solutions,
       masses ? at::cat({elastic, at::zeros({b, 2 * c, 3}, elastic.options())}, 1) : elastic};
   const PairTensors own = is_float ? pair_gradients_typed<Backend, float>(solved, pairs, all.plan)
                                    : pair_gradients_typed<Backend, double>(solved, pairs, all.plan);

@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 import torch
 from adjoint_scenes import seeded
-from body_scenes import G, H, THICKNESS, simulator
-from rigid_scenes import RIGID_CASES, RigidStep, ball, box, colliders_alone, pinned, pushed_plate
+from body_scenes import THICKNESS, G, H, simulator
+from rigid_scenes import RIGID_CASES, RigidStep, ball, batched, box, colliders_alone, pinned, pushed_plate, row
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchpd as pd
 
@@ -103,20 +104,6 @@ def test_a_wrench_over_many_steps() -> None:
     assert float(found @ direction) == pytest.approx(wanted, rel=1e-4)
 
 
-def batched(step: RigidStep, count: int) -> RigidStep:
-    """Environments that differ: the plate, or ball, of each has another velocity."""
-    parts = [each.expand(count, *each.shape[1:]).clone() for each in (*step.state[:2], *step.state.history)]
-    x, v, *history = parts
-    history = pd.ContactHistory(*history)
-    history.motion[:, 0, 0] += 0.01 * torch.arange(count, dtype=x.dtype)
-    return RigidStep(step.sim, pd.HistoryState(x, v, history), step.wrenches, step.colliders)
-
-
-def row(step: RigidStep, number: int) -> RigidStep:
-    x, v, *history = (each[[number]] for each in (*step.state[:2], *step.state.history))
-    return RigidStep(step.sim, pd.HistoryState(x, v, pd.ContactHistory(*history)), step.wrenches, step.colliders)
-
-
 @pytest.mark.parametrize("make", [ball, pushed_plate])
 def test_the_same_bits_in_a_batch(make: Any, two_threads: None) -> None:
     """Gradients of an environment have the bits that it has alone, and again."""
@@ -130,6 +117,55 @@ def test_the_same_bits_in_a_batch(make: Any, two_threads: None) -> None:
         alone = row(step, number).gradients()
         for name in names:
             assert torch.equal(together[name][number], alone[name][0]), name
+
+
+class Recorded(TorchDispatchMode):
+    """Keeps the arguments of the adjoint."""
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if function.name() == "torchpd::contact_step_vjp":
+            self.call = args, kwargs
+        return function(*args, **(kwargs or {}))
+
+
+def test_opcheck() -> None:
+    """The adjoint of two environments with a ball, one with another one on a plate."""
+    for step in (batched(ball(), 2), colliders_alone()):
+        with Recorded() as recorded:
+            step.gradients()
+        report = torch.library.opcheck(torch.ops.torchpd.contact_step_vjp.default, *recorded.call)
+        assert set(report.values()) == {"SUCCESS"}
+
+
+def test_compiled() -> None:
+    """A compiled step has the gradients of an eager one, to the bit."""
+    step = ball()
+    inputs, sim = step.inputs(), step.sim
+    found = []
+
+    def of(push: Tensor) -> Tensor:
+        return sim(step.state, targets={step.colliders[0]: push}).history.motion.sum()
+
+    for function in (of, torch.compile(of, fullgraph=True, backend="aot_eager")):
+        push = inputs["wrenches"][0].clone().requires_grad_()
+        found.append(torch.autograd.grad(function(push), push)[0])
+    assert found[0].all()
+    assert torch.equal(*found)
+
+
+def test_where_no_solution_is_found() -> None:
+    """A step far from an equilibrium has the gradients of constant rotations, with a warning, and they are finite."""
+    cube, pin = pinned()
+    plate = pd.Collider(box((0.07, 0.01, 0.06), (1, 1, 1)), mass=0.05, pose=(0.004, 0.0085, 0.003, 1, 0, 0, 0))
+    sim = simulator(pd.Scene(cube, pin, plate, pd.Contact(friction=0.5, thickness=THICKNESS)), 2)
+    state: Any = sim.rest_state()
+    state.history.motion[:, 0, 1] = -3.0
+    state.velocities[:] = 2.0 * seeded(state.velocities, 1)
+    push = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    with pytest.warns(UserWarning, match="adjoint"):
+        (found,) = torch.autograd.grad(sim(state, targets={plate: push}).history.motion.sum(), push)
+    assert found.isfinite().all()
+    assert found.any()
 
 
 def test_float32() -> None:

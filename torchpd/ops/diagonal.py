@@ -74,8 +74,8 @@ def step_diagonal(
 ) -> tuple[Tensor, Tensor]:
     """Inertia a and diagonal D of every vertex, [V] or [B, V], in N/m; inf at hard pins.
 
-    D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted. With Poisson's ratio 2 mu l_e + 4 lambda takes
-    the place of l_e w_e, and 2 mu + lambda that of w_e. Other elements add theirs, damping 2 mu beta / h l_e.
+    D_i = a_i + sum_e l_e w_e V_e |grad N_i|^2, l_e = 1 when not weighted. With Poisson's ratio 2 mu l_e + 4 lambda
+    takes the place of l_e w_e, and 2 mu + lambda that of w_e. Other elements add theirs, damping 2 mu beta / h l_e.
     """
     inertia = step_inertia(plan, material_arrays, time_step)
     return inertia, inertia + torch.ops.torchpd.elastic_diagonal(

@@ -18,8 +18,8 @@ __all__ = ["INFO_WIDTH"]
 INFO_WIDTH = _C.info_numbers
 CONTACT_INFO_WIDTH = 8  # contact_info_count of csrc/contact/views.h
 CONTACT_MISSING = 1  # its column of pairs that the capacity lacks
-# places among the arrays of contact, csrc/binding/contact_ops.h: the body of each vertex, points of colliders, friction,
-# masses of colliders and thickness
+# places among the arrays of contact, csrc/binding/contact_ops.h: the body of each vertex, points of colliders,
+# friction, masses of colliders and thickness
 CONTACT_BODY, CONTACT_LOCAL, CONTACT_FRICTION, CONTACT_RIGID, CONTACT_THICKNESS = 4, 14, 16, 17, 18
 
 

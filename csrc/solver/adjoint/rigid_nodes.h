@@ -43,7 +43,7 @@ struct RigidNode {
   RigidNumbers<double> at;
   Pose<double> end;
   double size;
-  Vec3<double> center;  // of mass
+  Vec3<double> center;              // of mass
   Mat3<double> inertia, stiffness;  // J / s^2; the derivative of the second row by z
 
   template <class T>
@@ -107,8 +107,9 @@ struct RigidNode {
     RigidNumbers<D> own;
     for (int n = 0; n < rigid_numbers; ++n) own.row[n] = D(at.row[n]);
     for (int n = 0; n < 7; ++n) own.begin[n] = own.goal[n] = D(at.begin[n]);
-    const Quaternion<D> by{D(1.0), {D(0.0, j == 0 ? 0.5 : 0.0), D(0.0, j == 1 ? 0.5 : 0.0),
-                                    D(0.0, j == 2 ? 0.5 : 0.0)}};
+    const Quaternion<D> by{
+        D(1.0),
+        {D(0.0, j == 0 ? 0.5 : 0.0), D(0.0, j == 1 ? 0.5 : 0.0), D(0.0, j == 2 ? 0.5 : 0.0)}};
     const Vec3<D> torque = own.torque(by * Quaternion<D>{D(end.w), still(end.axis)});
     return {torque.x.slope, torque.y.slope, torque.z.slope};
   }

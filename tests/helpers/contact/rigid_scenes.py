@@ -21,7 +21,7 @@ Point = tuple[float, float, float]
 # m, m/s, N: where neither truncation of a central difference nor rounding counts; of others a share of their size
 STEPS = {
     "positions": 1e-7, "velocities": 1e-5, "forces": 1e-4, "poses": 1e-7, "motion": 1e-5, "wrenches": 1e-5,
-    "contact_friction": 1e-6, "contact_thickness": 1e-7, "gravity": 1e-4,
+    "contact_friction": 1e-6, "contact_thickness": 1e-7, "gravity": 1e-4, "pin_targets": 1e-7,
 }  # fmt: skip
 
 
@@ -66,9 +66,7 @@ class RigidStep:
         kept = sim.body_contact
         try:
             sim.body_contact = replace(contact, arrays=arrays)
-            return torch.func.functional_call(
-                sim, material, (state,), {"forces": inputs["forces"], "targets": targets}
-            )
+            return torch.func.functional_call(sim, material, (state,), {"forces": inputs["forces"], "targets": targets})
         finally:
             sim.body_contact = kept
 
@@ -98,11 +96,23 @@ class RigidStep:
 
     def on(self, device: torch.device, dtype: torch.dtype = torch.float64) -> RigidStep:
         """The same step elsewhere."""
-        sim = pd.Simulator(
-            self.sim.scene, H, self.sim.iterations, dtype=dtype, device=device, progress=False
-        )
+        sim = pd.Simulator(self.sim.scene, H, self.sim.iterations, dtype=dtype, device=device, progress=False)
         state = self.state.to(dtype).to(device)
         return RigidStep(sim, state, self.wrenches.to(device, dtype), self.colliders)
+
+
+def batched(step: RigidStep, count: int) -> RigidStep:
+    """Environments that differ: the plate, or ball, of each has another velocity."""
+    parts = [each.expand(count, *each.shape[1:]).clone() for each in (*step.state[:2], *step.state.history)]
+    x, v, *history = parts
+    history = pd.ContactHistory(*history)
+    history.motion[:, 0, 0] += 0.01 * torch.arange(count, dtype=x.dtype)
+    return RigidStep(step.sim, pd.HistoryState(x, v, history), step.wrenches, step.colliders)
+
+
+def row(step: RigidStep, number: int) -> RigidStep:
+    x, v, *history = (each[[number]] for each in (*step.state[:2], *step.state.history))
+    return RigidStep(step.sim, pd.HistoryState(x, v, pd.ContactHistory(*history)), step.wrenches, step.colliders)
 
 
 def quaternion(axis: Point, degrees: float) -> tuple[float, float, float, float]:
@@ -120,10 +130,10 @@ def soft(center: Point, edge: float = 0.1) -> pd.Solid:
     return pd.Solid(box((edge,) * 3, (2, 2, 2), center), youngs=1e5, density=1000.0)
 
 
-def pinned() -> tuple[pd.Solid, pd.Pin]:
+def pinned(stiffness: float = 2e3) -> tuple[pd.Solid, pd.Pin]:
     """A cube whose top is at 0, and springs that hold its bottom."""
     cube = soft((0.003, -0.05, 0.002))
-    return cube, pd.Pin(cube, np.flatnonzero(cube.mesh.vertices[:, 1] < -0.0999), stiffness=2e3)
+    return cube, pd.Pin(cube, np.flatnonzero(cube.mesh.vertices[:, 1] < -0.0999), stiffness=stiffness)
 
 
 def prepared(
@@ -146,8 +156,8 @@ def prepared(
 def pushed_plate(friction: float = 0.0) -> RigidStep:
     """A wrench presses a light plate on a soft cube."""
     pose = (0.004, 0.0085, 0.003, *quaternion((0.02, 1, 0.03), 12.0))
-    plate = pd.Collider(box((0.07, 0.01, 0.06), (2, 1, 2)), mass=0.05, pose=pose)
-    return prepared([*pinned(), plate], [[0.3, -2.0, 0.1, 0.002, 0.001, -0.003]], 4, 2000, friction)
+    plate = pd.Collider(box((0.07, 0.01, 0.06), (1, 1, 1)), mass=0.05, pose=pose)
+    return prepared([*pinned(1e4), plate], [[0.3, -2.0, 0.1, 0.002, 0.001, -0.003]], 4, 800, friction)
 
 
 @cache
