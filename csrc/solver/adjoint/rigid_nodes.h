@@ -47,7 +47,7 @@ struct RigidNode {
   Mat3<double> inertia, stiffness;  // J / s^2; the derivative of the second row by z
 
   template <class T>
-  PD_HD void set(const T* row, const T* begin, const T* after, const T* goal) {
+  PD_CALLED void set(const T* row, const T* begin, const T* after, const T* goal) {
     for (int n = 0; n < rigid_numbers; ++n) at.row[n] = double(row[n]);
     double pose[7];
     for (int n = 0; n < 7; ++n) {
@@ -79,7 +79,7 @@ struct RigidNode {
   }
 
   // -l . dr / dp for input p, in the order of RigidNumbers, with the multipliers of both nodes.
-  PD_HD double gradient(int input, const Vec3<double>& shift, const Vec3<double>& z) const {
+  PD_CALLED double gradient(int input, const Vec3<double>& shift, const Vec3<double>& z) const {
     using D = Dual<double>;
     RigidNumbers<D> own;
     const auto vary = [&](D* to, const double* from, int count, int first) {
