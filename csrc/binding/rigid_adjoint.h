@@ -70,8 +70,8 @@ struct RigidSystem {
                  across = 2.0 * cross(axis, center),
                  arm = center + w * across + cross(axis, across), force = vector(grad, 0),
                  by_axis = vector(grad, 4);
-    const Tensor torque = 0.5 * (w * by_axis - number(grad, 3) * axis + cross(axis, by_axis)) -
-                          cross(arm, force);
+    const Tensor torque =
+        0.5 * (w * by_axis - number(grad, 3) * axis + cross(axis, by_axis)) - cross(arm, force);
     const Tensor moments = number(rows, 4) + number(rows, 7) + number(rows, 9);
     const Tensor size = (0.5 * moments / weight.unsqueeze(-1)).sqrt();
     const auto both = [&](const Tensor& shift, const Tensor& turn) {

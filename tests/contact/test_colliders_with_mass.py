@@ -362,20 +362,6 @@ def test_planes_and_spheres_pass_through_them_with_a_warning(wall: pd.Ground | p
         simulator(pd.Scene(soft(0.0, 0.5, 0.0), ball, wall, contact()), 4)
 
 
-def test_gradients_are_refused_by_name() -> None:
-    sim, _, start = meeting(0.5, 4)
-    state = start._replace(velocities=start.velocities.clone().requires_grad_())
-    with pytest.raises(RuntimeError, match="Collider has a mass"):
-        sim(state).positions.sum().backward()
-
-
-def test_a_gradient_by_a_wrench_alone_is_refused_by_name() -> None:
-    sim, block, state = meeting(0.5, 4)
-    push = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-    with pytest.raises(RuntimeError, match="Collider has a mass"):
-        sim(state, targets={block: push}).history.motion.sum().backward()
-
-
 def test_a_compiled_step_has_the_same_bits() -> None:
     sim, block, state = meeting(0.5, 4)
     push = torch.tensor([0.0, -1.0, 0, 0, 0, 0.01]).double()

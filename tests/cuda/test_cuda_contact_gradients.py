@@ -33,7 +33,7 @@ import torchpd as pd
 require_gpu()
 pytestmark = pytest.mark.filterwarnings("ignore::torchpd.MeshWarning")
 
-NAMES = ("positions", "velocities", "forces", "end", "start", "friction", "thickness")
+NAMES = ("positions", "velocities", "forces", "end", "start", "friction", "thickness", "rigid")
 
 
 def pressed() -> Step:

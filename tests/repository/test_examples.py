@@ -227,6 +227,14 @@ def test_light_finger(run, mass: str) -> None:
     assert held == pytest.approx(drag, rel=2e-2)
 
 
+def test_train_finger(run) -> None:
+    text = run("train_finger.py", "--steps", "12", "--tries", "4")
+    distances = [float(number) for number in re.findall(r"^ +\d+ +(\S+)$", text, flags=re.MULTILINE)]
+    assert len(distances) == 4
+    (end,) = numbers(text, r"end +(\S+)")
+    assert end < 0.8 * distances[0]
+
+
 def test_push_by_collider(run) -> None:
     text = run("push_by_collider.py", "--steps", "10", "--tries", "4")
     distances = [float(number) for number in re.findall(r"^ +\d+ +(\S+)$", text, flags=re.MULTILINE)]

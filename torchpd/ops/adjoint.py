@@ -38,11 +38,8 @@ ADJOINT_TOLERANCE = dict(zip((torch.float32, torch.float64), _C.adjoint_toleranc
 _STRETCH = 1e4
 # In csrc/binding/contact_adjoint_ops.h: positions before and after a step, and points of colliders; poses; masses.
 _CONTACT = 7
-_PLACES_OF_PAIRS, _POSES_OF_PAIRS, _RIGID_OF_PAIRS = (
-    (0, 1, _CONTACT + CONTACT_LOCAL),
-    (2, 3, 4),
-    _CONTACT + CONTACT_RIGID,
-)
+_PLACES_OF_PAIRS, _POSES_OF_PAIRS = (0, 1, _CONTACT + CONTACT_LOCAL), (2, 3, 4)
+_RIGID_OF_PAIRS = _CONTACT + CONTACT_RIGID
 # Powers of the stretch in a row of masses: mass, centre, moment of inertia, angular momentum.
 _RIGID_POWERS = (0, *[1] * 3, *[2] * 6, *[2] * 3)
 

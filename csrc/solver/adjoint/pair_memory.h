@@ -17,11 +17,11 @@ constexpr int most_slots = 5;
 // moves.
 struct PairItem {
   int vertex[4];
-  int slot[4];              // of each corner, the first of two, -1: of none
-  Vec3<double> arm[4];      // of corners of colliders that move: from the centre, over the size
-  int node[most_slots];     // -1 pads
-  int corner[most_slots];   // the first one
-  int moves[most_slots];    // its node, -1 where it does not move
+  int slot[4];             // of each corner, the first of two, -1: of none
+  Vec3<double> arm[4];     // of corners of colliders that move: from the centre, over the size
+  int node[most_slots];    // -1 pads
+  int corner[most_slots];  // the first one
+  int moves[most_slots];   // its node, -1 where it does not move
   LoadedPair<double> pair;
   PairSlopes<double> slopes;
   double step;  // of its multipliers in a sweep
@@ -60,11 +60,11 @@ struct PairSizes {
 struct PairMemory {
   int slots;  // of a pair
   PairItem* item;
-  RigidNode* rigid;                 // [colliders]
-  int *first, *end;                 // [pairs] rows
-  Vec3<double>*held, *pushed;       // [slots rows] C and B at the nodes that move
-  int *of_item, *as_pivot;          // [rows] item, and number among the independent rows, or -1
-  int* moves;                       // [slots rows] nodes that move, or -1
+  RigidNode* rigid;            // [colliders]
+  int *first, *end;            // [pairs] rows
+  Vec3<double>*held, *pushed;  // [slots rows] C and B at the nodes that move
+  int *of_item, *as_pivot;     // [rows] item, and number among the independent rows, or -1
+  int* moves;                  // [slots rows] nodes that move, or -1
   PairPatch* patch;
   int* slot;                  // [keys + 1] items before each key
   int* internal;              // [vertices] internal numbers of the user's

@@ -197,6 +197,19 @@ class AdjointPairs {
     return is_turn(item.node[s]) ? square_root(dot(sum, sum)) : 1.0;
   }
 
+  // Sum of |w| at a vertex: of all corners of a body's node, or of one vertex of a collider.
+  PD_HD double spread_of(int node, int vertex) const {
+    double sum = 0;
+    for (int n = m_.start[node]; n < m_.start[node + 1]; ++n) {
+      const PairItem& item = m_.item[m_.entry[n] / m_.slots];
+      const int s = m_.entry[n] % m_.slots;
+      if (vertex < 0) sum += absolute(item.pair.frame.weight[item.corner[s]]);
+      for (int a = 0; vertex >= 0 && a < 4; ++a)
+        if (item.vertex[a] == vertex) sum += absolute(item.pair.frame.weight[a]);
+    }
+    return sum;
+  }
+
   PD_HD Place sum_of(int node, const Vec3<double>* part) const {
     Place sum = {0, 0, 0};
     for (int n = m_.start[node]; n < m_.start[node + 1]; ++n) {
@@ -342,33 +355,30 @@ class AdjointPairs {
     });
   }
 
-  // Steps of the pairs; adds to D the stiffness by which the slips turn.
+  // Steps of the pairs, those of the sweeps; adds to D the stiffness by which the slips turn.
   template <class Inverse>
   PD_HD void weigh(const Inverse& inverse) {
-    const auto slot = [&](int n, const auto& visit) {
-      const PairItem& item = m_.item[m_.entry[n] / m_.slots];
-      visit(item, slot_weight(item, m_.entry[n] % m_.slots));
-    };
-    team_.each(nodes_, [&](int v) {
-      m_.spread[v] = 0;
-      for (int n = m_.start[v]; n < m_.start[v + 1]; ++n)
-        slot(n, [&](const PairItem&, double weight) { m_.spread[v] += weight; });
-    });
+    team_.each(count_, [&](int v) { m_.spread[v] = spread_of(v, -1); });
     team_.each(m_.counts->pairs, [&](int n) {
       PairItem& item = m_.item[n];
       double yielding = 0;
-      for (int s = 0; s < m_.slots; ++s) {
-        const int v = item.node[s];
-        if (v >= 0) yielding += slot_weight(item, s) * m_.spread[v] * double(inverse(v));
+      for (int a = 0; a < 4; ++a) {
+        const int v = item.slot[a] < 0 ? -1 : item.node[item.slot[a]];
+        if (v < 0) continue;
+        const double own = v < count_ ? m_.spread[v] * double(inverse(v))
+                                      : spread_of(v, item.vertex[a]) * rigid_yield /
+                                            m_.rigid[(v - count_) / 2].at.weight();
+        yielding += absolute(item.pair.frame.weight[a]) * own;
       }
       item.step = yielding > 0 ? 1 / yielding : 0.0;
     });
     team_.each(nodes_, [&](int v) {
       double more = 0;
-      for (int n = m_.start[v]; n < m_.start[v + 1]; ++n)
-        slot(n, [&](const PairItem& item, double weight) {
-          more += item.slopes.stiffness * weight * weight;
-        });
+      for (int n = m_.start[v]; n < m_.start[v + 1]; ++n) {
+        const PairItem& item = m_.item[m_.entry[n] / m_.slots];
+        const double weight = slot_weight(item, m_.entry[n] % m_.slots);
+        more += item.slopes.stiffness * weight * weight;
+      }
       T& own = inverse(v);
       if (more > 0 && own > T(0)) own = T(1 / (1 / double(own) + more));
       m_.inverse[v] = double(own);

@@ -43,11 +43,11 @@ struct RigidNode {
   RigidNumbers<double> at;
   Pose<double> end;
   double size;
-  Vec3<double> center;  // of mass
+  Vec3<double> center;              // of mass
   Mat3<double> inertia, stiffness;  // J / s^2; the derivative of the second row by z
 
   template <class T>
-  PD_HD void set(const T* row, const T* begin, const T* after, const T* goal) {
+  PD_CALLED void set(const T* row, const T* begin, const T* after, const T* goal) {
     for (int n = 0; n < rigid_numbers; ++n) at.row[n] = double(row[n]);
     double pose[7];
     for (int n = 0; n < 7; ++n) {
@@ -79,7 +79,7 @@ struct RigidNode {
   }
 
   // -l . dr / dp for input p, in the order of RigidNumbers, with the multipliers of both nodes.
-  PD_HD double gradient(int input, const Vec3<double>& shift, const Vec3<double>& z) const {
+  PD_CALLED double gradient(int input, const Vec3<double>& shift, const Vec3<double>& z) const {
     using D = Dual<double>;
     RigidNumbers<D> own;
     const auto vary = [&](D* to, const double* from, int count, int first) {
@@ -107,8 +107,9 @@ struct RigidNode {
     RigidNumbers<D> own;
     for (int n = 0; n < rigid_numbers; ++n) own.row[n] = D(at.row[n]);
     for (int n = 0; n < 7; ++n) own.begin[n] = own.goal[n] = D(at.begin[n]);
-    const Quaternion<D> by{D(1.0), {D(0.0, j == 0 ? 0.5 : 0.0), D(0.0, j == 1 ? 0.5 : 0.0),
-                                    D(0.0, j == 2 ? 0.5 : 0.0)}};
+    const Quaternion<D> by{
+        D(1.0),
+        {D(0.0, j == 0 ? 0.5 : 0.0), D(0.0, j == 1 ? 0.5 : 0.0), D(0.0, j == 2 ? 0.5 : 0.0)}};
     const Vec3<D> torque = own.torque(by * Quaternion<D>{D(end.w), still(end.axis)});
     return {torque.x.slope, torque.y.slope, torque.z.slope};
   }
