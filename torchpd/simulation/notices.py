@@ -106,7 +106,7 @@ def _places(part: Member) -> Array:
 def _overlaps(
     scene: Scene, parts: Mapping[int, Member], places: Sequence[Array]
 ) -> tuple[list[Overlap], list[Overlap]]:
-    """Pairs of parts by their numbers, of which one has points inside the other: solids that do not collide, and nested.
+    """Pairs of parts of which one has points inside the other: solids that do not collide, and nested ones.
 
     Args:
         scene: that has the parts.
