@@ -185,7 +185,8 @@ class Simulator(Stepper):
     def load(path: str | Path) -> Simulator:
         """Read a file of `save` onto the CPU and compile its scene.
 
-        Pins and spheres are new objects: `sim.scene.pins` and `sim.scene.spheres`, in their original order.
+        All parts are new objects in their original order, and keys of `targets` and read-outs: `sim.scene.bodies`,
+        `sim.scene.colliders`, `sim.scene.pins` and `sim.scene.spheres`.
         """
         saved = load_simulation(path)
         with reading(path):

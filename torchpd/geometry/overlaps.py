@@ -1,4 +1,4 @@
-"""Overlap of bodies: points behind the surface of one that lie inside tetrahedra of another."""
+"""Overlap of bodies: points of one, of a solid those behind its surface, that lie inside tetrahedra of another."""
 
 from __future__ import annotations
 
@@ -27,28 +27,31 @@ class Overlap(NamedTuple):
 
     first: int  # number of the body
     second: int
-    points: int  # points behind the surface of either that lie inside the other
+    points: int  # points of either that lie inside the other
 
 
-def find_overlaps(meshes: Sequence[TetMesh], places: Sequence[Array] | None = None) -> list[Overlap]:
+def find_overlaps(meshes: Sequence[TetMesh | None], places: Sequence[Array] | None = None) -> list[Overlap]:
     """Pairs of bodies of which one has points inside the other.
 
-    The points are corners and centroids of tets behind the surface. An overlap between two such points, where edges
-    cross a thin part, is not found. Pairs whose bounding boxes are apart cost nothing.
+    The points of a solid are corners and centroids of tets behind the surface, those of surfaces and rods are their
+    vertices. An overlap between two such points, where edges cross a thin part, is not found. Pairs whose bounding
+    boxes are apart cost nothing.
 
     Args:
-        meshes: of the bodies.
+        meshes: of the bodies; None for surfaces and rods, which have no inside.
         places: their vertices [V, 3] m; by default those of the meshes.
     """
-    places = [mesh.vertices for mesh in meshes] if places is None else places
+    if places is None:
+        places = [mesh.vertices for mesh in meshes if mesh is not None]
     lows, highs = (np.stack([end(place, axis=0) for place in places]) for end in (np.min, np.max))
     found = []
     for first, second in _near(lows, highs):
         low = np.maximum(lows[first], lows[second])
         high = np.minimum(highs[first], highs[second])
         points = sum(
-            _count_inside(_points(meshes[one], places[one], low, high), places[other], meshes[other].tets, low, high)
+            _count_inside(_points(meshes[one], places[one], low, high), places[other], solid.tets, low, high)
             for one, other in ((first, second), (second, first))
+            if (solid := meshes[other]) is not None
         )
         if points:
             found.append(Overlap(first, second, points))
@@ -77,11 +80,14 @@ def _near(lows: Array, highs: Array) -> Iterator[tuple[int, int]]:
             yield first, first + 1 + int(later)
 
 
-def _points(mesh: TetMesh, place: Array, low: Array, high: Array) -> Array:
-    """Points behind the surface of a body in a box: centroids of tets, and corners pulled slightly towards a centroid.
+def _points(mesh: TetMesh | None, place: Array, low: Array, high: Array) -> Array:
+    """Points of a body in a box.
 
-    So bodies that share a face do not overlap. If both have the same grid, no corner lies on a face of the other.
+    Of a solid those behind its surface: centroids of tets, and corners pulled slightly towards a centroid. So solids
+    that share a face do not overlap. If both have the same grid, no corner lies on a face of the other.
     """
+    if mesh is None:
+        return np.asarray(place[np.all((place >= low) & (place <= high), axis=1)])
     outer = np.zeros(len(place), dtype=np.bool_)
     outer[mesh.boundary()] = True
     behind = mesh.tets[outer[mesh.tets].sum(axis=1) >= 3]

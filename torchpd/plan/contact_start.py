@@ -46,9 +46,11 @@ def check_start(plan: ContactPlan, positions: Array, rounding: float, name: str)
         if len(distance) and distance.min() <= least:
             four = corners[int(distance.argmin())].tolist()
             one, other = own_vertices(plan.body, four[:sides]), own_vertices(plan.body, four[sides:])
+            rigid = (plan.collider[four] >= 0).any()
+            fix = "; a Pin of vertices near the collider can follow it" if rigid else ", or join them by a Tie"
             raise ValueError(
                 f"{name} must leave {least:.1e} m between surfaces, got {distance.min():.1e} m between {one} and "
-                f"{other}; leave the thickness, {plan.thickness:.3g} m, or join them by a Tie"
+                f"{other}; leave the thickness, {plan.thickness:.3g} m{fix}"
             )
 
 

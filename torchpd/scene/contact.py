@@ -13,6 +13,7 @@ from ..common.checks import as_array, check_finite, check_scalar, check_shape, c
 from ..common.synonyms import check_arguments
 from ..geometry.tet_mesh import TetMesh
 from ..geometry.tri_mesh import TriMesh
+from .effects import Ground, Sphere
 from .part import ArrayLike, Body, KeyPart, set_fields, unit_vectors
 from .rigid import RigidMass, rigid_mass
 from .rod import Polyline
@@ -223,8 +224,16 @@ def can_touch(one: Member, other: Member) -> bool:
 def _check_member(name: str, body: object) -> None:
     if isinstance(body, Collider) or (isinstance(body, Body) and body.has_surface):
         return
-    fix = "name those that take part, Contact(cloth, solid)" if isinstance(body, Body) else "pass them one by one"
-    raise TypeError(f"{name} takes Solid, Cloth, Rod and Collider, got {type(body).__name__}; {fix}")
+    kind = type(body).__name__
+    if isinstance(body, Body):
+        fix = "name those that take part, Contact(cloth, solid)"
+    elif isinstance(body, Ground | Sphere):
+        fix = f"every vertex meets a {kind}, whose coefficient is {kind}(friction=): leave it out"
+    elif isinstance(body, int | float):
+        fix = f"a coefficient of friction goes by name, Contact(friction={body})"
+    else:
+        fix = "pass them one by one"
+    raise TypeError(f"{name} takes Solid, Cloth, Rod and Collider, got {kind}; {fix}")
 
 
 def _capacity(value: Any) -> int | Literal["grow"] | None:

@@ -93,8 +93,9 @@ class Anchors:
         """
         placed: dict[str, Tensor] = {}
         if isinstance(targets, Tensor):
+            by_part = "; one tensor is for all pins, and a pose goes as {collider: pose}" if self.colliders else ""
             placed["pin_targets"] = self._checked(
-                "targets", targets, batch, [(self.pinned, 3)], material["pin_targets"], fix
+                "targets", targets, batch, [(self.pinned, 3)], material["pin_targets"], f"{by_part}{fix}"
             )
             return placed
         if not isinstance(targets, Mapping):

@@ -210,11 +210,11 @@ class BodyContact:
         return ContactSurfaces(triangles, edges, body, collider, points, cell, thickness.detach().to(points))
 
     @staticmethod
-    def check_transforms(*given: Tensor) -> None:
+    def check_transforms(*given: object) -> None:
         """Refuse `torch.func.vmap` and its kin, where not traced: the op refuses them there."""
         if torch.compiler.is_compiling():
             return
-        if any(map(torch._C._functorch.is_functorch_wrapped_tensor, given)):
+        if any(isinstance(of, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(of) for of in given):
             raise RuntimeError(
                 "a step with Contact must not be transformed by torch.func or vmap, got mapped arguments; "
                 "put the environments in the batch of a state instead: sim.rest_state(batch)"

@@ -7,26 +7,33 @@ of a simulator, of which studies make many, do not warn.
 from __future__ import annotations
 
 import weakref
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from ..common.tables import PLANES, SPHERES
 from ..common.warn import SceneWarning, warn_user
 from ..geometry.overlaps import Overlap, boxes_meet, find_overlaps
 from ..plan.material import CORE_ROWS
+from ..scene.contact import Collider, Member, placed
 from ..scene.effects import Solid
 from ..scene.part import Body
 from ..scene.scene import Scene
+from ..scene.tie import Tie
 from .state import HistoryState, State
 
 __all__ = ["Notices", "warn_of_scene"]
 
+Array = NDArray[np.float64]
+
 _ROUNDINGS = 10.0  # machine epsilons of a position that a contact may be violated by
 _PLANES, _SPHERES, _GRAVITY = (CORE_ROWS.index(name) for name in ("planes", "spheres", "gravity"))
 _ALONE = "bodies do not collide without Contact: add Contact() to the scene, or move them apart"
+_NESTED = "one lies inside the other, where Contact keeps it: move them apart"
 _INVERTED, _MISSING = 6, 8  # columns of the rows of a report
 
 
@@ -34,8 +41,7 @@ def warn_of_scene(scene: Scene) -> None:
     """Warn of bodies that overlap at rest, and of planes and spheres that do not meet what looks as if they did."""
     _say_small_spheres(scene)
     _say_rigid(scene)
-    if len(scene.solids) > 1 and _may_pass(scene):
-        _say_overlaps(scene, find_overlaps([solid.mesh for solid in scene.solids]), "at rest")
+    _say_rest(scene)
 
 
 def _say_small_spheres(scene: Scene) -> None:
@@ -76,16 +82,55 @@ def _kinds(bodies: list[Body]) -> str:
     return ", ".join(dict.fromkeys(type(body).__name__ for body in bodies))
 
 
-def _say_overlaps(scene: Scene, found: list[Overlap], where: str) -> None:
-    """Warn of pairs of solids that pass through each other, by their numbers among all bodies."""
-    found = [one for one in found if not all(_takes_part(scene, scene.solids[n]) for n in (one.first, one.second))]
+def _say_rest(scene: Scene) -> None:
+    """Warn of solids that overlap at rest, and of what lies inside a solid in a `Contact`.
+
+    Surfaces of `Contact` do not cross, so of two that overlap one lies inside the other. A `Tie` may mean it.
+    """
+    parts: list[Member] = [*scene.bodies, *scene.colliders]
+    looked = {n: part for n, part in enumerate(parts) if isinstance(part, Solid) or _takes_part(scene, part)}
+    if not scene.solids or len(looked) < 2:
+        return
+    tied = [{id(part.body), id(part.other)} for part in scene.parts if isinstance(part, Tie)]
+    passing, nested = _overlaps(scene, looked, [_places(part) for part in looked.values()])
+    _say_overlaps(passing, "at rest", _ALONE)
+    _say_overlaps([o for o in nested if {id(parts[o.first]), id(parts[o.second])} not in tied], "at rest", _NESTED)
+
+
+def _places(part: Member) -> Array:
+    """Vertices [n, 3] m at rest."""
+    points: Array = part.mesh.vertices
+    return placed(np.tile(part.pose, (len(points), 1)), points) if isinstance(part, Collider) else points
+
+
+def _overlaps(
+    scene: Scene, parts: Mapping[int, Member], places: Sequence[Array]
+) -> tuple[list[Overlap], list[Overlap]]:
+    """Pairs of parts of which one has points inside the other: solids that do not collide, and nested ones.
+
+    Args:
+        scene: that has the parts.
+        parts: by number.
+        places: of their vertices [n, 3] m.
+    """
+    numbers = list(parts)
+    solids = [part.mesh if isinstance(part, Solid) else None for part in parts.values()]
+    passing, nested = [], []
+    for first, second, points in find_overlaps(solids, places):
+        one = Overlap(numbers[first], numbers[second], points)
+        if all(_takes_part(scene, parts[number]) for number in one[:2]):
+            nested.append(one)
+        elif all(isinstance(parts[number], Solid) for number in one[:2]):
+            passing.append(one)
+    return passing, nested
+
+
+def _say_overlaps(found: Sequence[Overlap], where: str, why: str) -> None:
+    """Warn of pairs of parts by their numbers: all bodies, then colliders."""
     if found:
-        numbers = [number for number, body in enumerate(scene.bodies) if isinstance(body, Solid)]
-        pairs = ", ".join(
-            f"{numbers[o.first]} and {numbers[o.second]} ({o.points} points of their surfaces)" for o in found[:3]
-        )
+        pairs = ", ".join(f"{o.first} and {o.second} ({o.points} points of their surfaces)" for o in found[:3])
         more = f" and {len(found) - 3} pairs more" if len(found) > 3 else ""
-        warn_user(f"Simulator: bodies {pairs}{more} overlap {where}, and {_ALONE}", SceneWarning)
+        warn_user(f"Simulator: bodies {pairs}{more} overlap {where}, and {why}", SceneWarning)
 
 
 def _may_pass(scene: Scene) -> bool:
@@ -93,9 +138,9 @@ def _may_pass(scene: Scene) -> bool:
     return not all(_takes_part(scene, solid) for solid in scene.solids)
 
 
-def _takes_part(scene: Scene, solid: Solid) -> bool:
+def _takes_part(scene: Scene, part: Member) -> bool:
     contact = scene.contact
-    return contact is not None and (not contact.bodies or any(solid is one for one in contact.bodies))
+    return contact is not None and (not contact.bodies or any(part is one for one in contact.bodies))
 
 
 class Notices:
@@ -211,9 +256,11 @@ class Notices:
         self._next = 2 * self._reports
         environment = int(meet.argmax())
         places = corners[environment].astype(np.float64)
-        if found := find_overlaps([solid.mesh for solid in scene.solids], [places[part] for part in ranges]):
+        solids: dict[int, Member] = {n: body for n, body in enumerate(scene.bodies) if isinstance(body, Solid)}
+        passing, _ = _overlaps(scene, solids, [places[part] for part in ranges])
+        if passing:
             self._said.add("overlap")
-            _say_overlaps(scene, found, f"in environment {environment} at the end of a step")
+            _say_overlaps(passing, f"in environment {environment} at the end of a step", _ALONE)
 
     def _looked_at(self, owner: object, positions: Tensor) -> Scene | None:
         """The scene, if this state can be checked."""

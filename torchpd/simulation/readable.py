@@ -190,9 +190,10 @@ class Readable(Model):
         return stress(self.scene, positions, rows)
 
     def check(self, state: State | HistoryState) -> None:
-        """Refuse a state that no step takes: its shapes, numbers, and surfaces of `Contact` that cross or touch.
+        """Refuse a state that no step takes: its shapes, what is not finite, surfaces of `Contact` that cross or touch.
 
-        A step checks no values. What a simulator returns is free of crossings; check states of your own once.
+        A step checks no values. What a simulator returns is free of crossings; check states of your own once. A body
+        that lies whole inside another one crosses nothing, and is not seen: docs/contact.md#what-is-checked.
 
         Args:
             state: as in `forward`.
@@ -203,13 +204,10 @@ class Readable(Model):
         """
         self.check_state(state)
         self.positions_of(state)
-        for name, values in (("positions", state[0]), ("velocities", state[1])):
-            bad = (~values.isfinite()).flatten(1).sum(1)
-            if bool(bad.any()):
-                first = int(bad.nonzero()[0])
-                raise ValueError(
-                    f"check: {name} must be finite, got {int(bad[first])} numbers that are not in environment {first}"
-                )
+        for name, array in (("positions", state[0]), ("velocities", state[1])):
+            if not bool(array.isfinite().all()):
+                environment = int((~array.isfinite()).flatten(1).any(dim=1).nonzero()[0])
+                raise ValueError(f"check: {name} must be finite, got others in environment {environment}; reset it")
         if self.body_contact is not None:
             self.body_contact.check(state)
 

@@ -47,6 +47,7 @@ from ..scene.effects import Ground, Pin, Sphere
 from ..scene.part import Body
 from ..scene.scene import Scene
 from ..scene.tie import Tie
+from .by_part import ByPart
 from .pair_forces import Met, PairForces, empty_pairs
 from .stencil_readouts import forces_of_ties
 from .wrenches import Loaded, Wrench, between, loaded_bodies, loaded_colliders, wrench, wrenches
@@ -84,9 +85,9 @@ class ContactForces(NamedTuple):
 
     force: Tensor  # [B, V, 3] N, of all contacts together, on the vertices
     residual: Tensor  # [B, V, 3] N, the part that neither contacts nor pins balance; zero at a solved step
-    bodies: dict[Member, Wrench]  # sum and torque of all contacts on each body and collider of `Contact`
+    bodies: ByPart[Member, Wrench]  # sum and torque of all contacts on each body and collider of `Contact`
     colliders: dict[Ground | Sphere, ContactForce]  # by ground and sphere; empty without any
-    between: dict[tuple[Member, Member], Wrench]  # on the first by the second; empty without `Contact`
+    between: ByPart[tuple[Member, Member], Wrench]  # on the first by the second; empty without `Contact`
     on_colliders: Tensor  # [B, C, 6] N and N m, force and torque on each `Collider` about its actual origin
     pairs: PairForces  # forces between surfaces, pair by pair
 
@@ -289,9 +290,9 @@ def contact_forces(scene: Scene, call: AdjointCall, about: Tensor | None, met: M
     return ContactForces(
         force=total,
         residual=residual,
-        bodies=dict([*wrenches(total, bodies).items(), *on_hands.items()]),
+        bodies=ByPart([*wrenches(total, bodies).items(), *on_hands.items()]),
         colliders=found,
-        between=between(scene, met, [*bodies.items(), *hands.items()]),
+        between=ByPart(between(scene, met, [*bodies.items(), *hands.items()])),
         on_colliders=torch.stack(stacked, dim=1) if stacked else total.new_zeros((len(total), 0, 6)),
         pairs=pairs,
     )

@@ -23,6 +23,7 @@ __all__ = [
     "check_adjoint",
     "check_batch",
     "check_info",
+    "check_overwritten",
     "check_positive_number",
     "check_state",
     "check_time_step",
@@ -137,7 +138,7 @@ def check_state(
 ) -> Tensor | None:
     """Implementation of `Model.check_state`, by the rest positions [V, 3] and history [n, ...] of a simulator.
 
-    `grows`: a history may have room for any number of pairs.
+    A history may have room for fewer pairs than the simulator. `grows`: also for more.
     """
     if not _is_state(state, history):
         raise TypeError(
@@ -161,6 +162,15 @@ def check_info(info: Tensor, shape: tuple[int, int]) -> None:
     if info.shape != shape or info.dtype != torch.float64:
         raise ValueError(
             f"step_: info must be float64 {list(shape)} in a scene with Contact, got {info.dtype} {list(info.shape)}"
+        )
+
+
+def check_overwritten(keys: Tensor, capacity: int) -> None:
+    """Check that the history of a state to overwrite has room for the pairs of a step."""
+    if keys.shape[-1] < capacity:
+        raise ValueError(
+            f"step_: history.keys must have room for {capacity} pairs, the capacity of Contact, got "
+            f"{list(keys.shape)}; call the simulator, whose next state has that room"
         )
 
 
@@ -188,8 +198,14 @@ def _check_history(state: State | HistoryState, history: History | ContactHistor
     if history is None:
         return
     given = history_of(state[2])  # type: ignore[misc]
-    if grows and isinstance(history, ContactHistory) and isinstance(given, ContactHistory) and given.keys.dim() == 2:
-        width = given.keys.shape[1]
+    if isinstance(history, ContactHistory) and isinstance(given, ContactHistory) and given.keys.dim() == 2:
+        width, room = given.keys.shape[1], history.keys.shape[-1]
+        if width > room and not grows:
+            raise ValueError(
+                f"history.keys must have room for at most {room} pairs, the capacity of Contact, got "
+                f"{list(given.keys.shape)}; make the scene with Contact(capacity={width}), or take the history of "
+                "rest_state()"
+            )
         history = history._replace(keys=history.keys[:1].expand(width), forces=history.forces[:1].expand(width, 4))
     for name, own, array in zip(history._fields, history, given, strict=True):
         _check_kind(own, f"history.{name}", array)

@@ -18,7 +18,7 @@ from ..scene.targets import NO_INPUTS, ColliderInputs, Targets
 from .readable import Readable
 from .rollout import PerStep, Rollout, run_rollout
 from .state import HistoryState, HistoryTrack, Info, State, StepCall, Track, history_of
-from .state_checks import check_info
+from .state_checks import check_info, check_overwritten
 
 __all__ = ["Stepper"]
 
@@ -229,6 +229,8 @@ class Stepper(Readable):
         info: Tensor | None,
     ) -> None:
         """`step_` in a scene with `Contact`."""
+        assert self.body_contact is not None
+        check_overwritten(state[2][1], self.body_contact.plan.capacity)  # type: ignore[misc]
         if info is not None:
             check_info(info, (len(state[0]), self.info_width))
         after, rows = self._stepped(state, forces, given, material, inputs, inertial=inertial, report=info is not None)
