@@ -139,3 +139,10 @@ def test_material_that_is_none_has_no_residual(what: float) -> None:
     stiffness[1] = what
     _, info = functional_call(sim, {"stiffness": stiffness}, (sim.rest_state(2),), {"return_info": True})
     assert info.residual.isnan().tolist() == [False, True]
+
+
+def test_a_checked_state_is_finite() -> None:
+    sim, state = sliding()
+    state.velocities[0, 3] = float("nan")
+    with pytest.raises(ValueError, match=r"check: velocities must be finite, .* environment 0"):
+        sim.check(state)
