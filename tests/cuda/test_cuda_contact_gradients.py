@@ -27,6 +27,7 @@ from on_gpu import GPU, relative
 from op_samples import OF_CONTACT, samples
 from runs import plan_of, settings_of
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 import torchpd as pd
 
@@ -215,6 +216,28 @@ def test_rollouts() -> None:
         wanted = float(way(friction + 1e-4) - way(friction - 1e-4)) / 2e-4
     assert wanted < 0.0
     assert float(found) == pytest.approx(wanted, rel=1e-3)
+
+
+def test_friction_of_each_environment() -> None:
+    """The bits and the gradients of each alone; the way of the CPU."""
+    step = sliding_cube()
+    sim, host = simulator(step.sim.scene, 64, device=GPU), simulator(step.sim.scene, 64)
+    values = torch.tensor([0.1, 0.3, 0.7], dtype=torch.float64, device=GPU)
+
+    def way(of: pd.Simulator, friction: Tensor) -> Tensor:
+        of.contact_friction = friction
+        state = tree_map(lambda array: array.repeat(len(friction), *[1] * (array.dim() - 1)), step.state.to(of.device))
+        return of.rollout(state, 3).state().positions[..., 0].mean(dim=1)
+
+    friction = values[:, None, None].requires_grad_()
+    together = way(sim, friction)
+    (found,) = torch.autograd.grad(together.sum(), friction)
+    torch.testing.assert_close(together.detach().cpu(), way(host, friction.detach().cpu()), rtol=0.0, atol=1e-10)
+    for number in range(3):
+        own = values[number, None, None, None].requires_grad_()
+        alone = way(sim, own)
+        assert torch.equal(alone[0], together[number])
+        assert torch.equal(torch.autograd.grad(alone.sum(), own)[0][0], found[number])
 
 
 def test_a_step_that_is_taken_back() -> None:
