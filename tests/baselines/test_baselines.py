@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -318,13 +315,3 @@ def test_newton_krylov_finds_contacts(ground: pd.Ground) -> None:
     rough = contact_block(pd.Ground(0.0, friction=0.5)).problem()
     with pytest.raises(ValueError, match="friction"):
         run_baseline(BASELINES["Newton-PCG with M"], rough, rough.first_iterate(), 1)
-
-
-def test_examination_is_not_imported_with_the_library() -> None:
-    """Neither the methods to compare with nor what draws them: they are asked for by name."""
-    ours = [f"torchpd.{name}" for name in ("baselines", "study", "accuracy.error", "accuracy.tuning", "reference")]
-    assert all(map(importlib.util.find_spec, ours))
-    modules = [*ours, "plotly", "matplotlib", "threadpoolctl", "trimesh"]
-    code = f"import sys, torchpd; print([name for name in {modules} if name in sys.modules])"
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert ended.stdout.strip() == "[]"

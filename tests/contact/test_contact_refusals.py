@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from body_scenes import THICKNESS, H, block, gripper, plane, pose, simulator, two_cubes
-from programs import ROOT
 from torch import Tensor
 
 import torchpd as pd
@@ -240,14 +237,3 @@ def test_overlaps_name_contact() -> None:
         pd.Simulator(pd.Scene(*bodies), progress=False)
     with pytest.warns(pd.SceneWarning, match="bodies 0 and 1 .* overlap at rest"):  # the second takes no part
         pd.Simulator(pd.Scene(*bodies, pd.Contact(bodies[0])), progress=False)
-
-
-def test_scenes_without_contact_load_nothing_of_it() -> None:
-    code = (
-        "import sys, torch, torchpd as pd; mesh = pd.shapes.box((1.0, 1.0, 1.0), (1, 1, 1));"
-        "sim = pd.Simulator(pd.Scene(pd.Solid(mesh, youngs=1e5, density=1e3)), progress=False);"
-        "sim.rollout(sim.rest_state(), 2);"
-        "print([name for name in sys.modules if 'torchpd' in name and 'contact' in name])"
-    )
-    found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert found.stdout.strip() == "['torchpd.scene.contact']"

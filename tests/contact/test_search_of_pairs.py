@@ -122,13 +122,25 @@ class Sides:
     distance: Array
 
 
+def near(low: Array, high: Array, others_low: Array, others_high: Array, reach: float) -> tuple[Index, Index]:
+    """Boxes that are nearer than `reach`: distances of all pairs of the larger scenes would take minutes."""
+    meet = np.ones((len(low), len(others_low)), dtype=bool)
+    for axis in range(3):
+        meet &= low[:, None, axis] <= others_high[:, axis] + reach
+        meet &= others_low[:, axis] <= high[:, None, axis] + reach
+    one, other = np.nonzero(meet)
+    return one, other
+
+
 def all_pairs(of: Case) -> Sides:
     plan, x = of.plan, of.places
     number, edges = len(plan.rest), plan.edges.astype(np.int64)
-    vertex, triangle = (
-        a.reshape(-1) for a in np.meshgrid(plan.vertices, np.arange(len(plan.triangles)), indexing="ij")
-    )
-    first, second = np.triu_indices(len(edges), 1)
+    points, corners, ends = x[plan.vertices], x[plan.triangles], x[edges]
+    reach = 2.0 * CELLS * plan.cell.max() + plan.thickness
+    vertex, triangle = near(points, points, corners.min(axis=1), corners.max(axis=1), reach)
+    first, second = near(*(f(axis=1) for f in (ends.min, ends.max) * 2), reach)
+    first, second = first[first < second], second[first < second]
+    vertex = plan.vertices[vertex].astype(np.int64)
     one = np.concatenate([np.stack([vertex, vertex], axis=1), edges[first]])
     other = np.concatenate([plan.triangles[triangle], edges[second][:, [0, 1, 1]]])
     keys = np.concatenate([
@@ -138,11 +150,6 @@ def all_pairs(of: Case) -> Sides:
     counts &= ~(plan.kinematic[one].all(axis=1) & plan.kinematic[other].all(axis=1))
     counts &= (plan.body[one[:, 0]] != plan.body[other[:, 0]]) | plan.self_contact[plan.body[one[:, 0]]]
     counts &= ~np.isin(keys, plan.near.keys[plan.near.thickness == 0.0])
-    # boxes first: distances of all pairs of the larger scenes would take minutes
-    reach = 2.0 * CELLS * plan.cell.max() + plan.thickness
-    low, high = (f(x[one], axis=1) for f in (np.min, np.max)), (f(x[other], axis=1) for f in (np.min, np.max))
-    (low_one, high_one), (low_other, high_other) = low, high
-    counts &= ((low_one <= high_other + reach) & (low_other <= high_one + reach)).all(axis=1)
     keys, one, other, edge = keys[counts], one[counts], other[counts], (np.arange(len(counts)) >= len(vertex))[counts]
     distance = np.empty(len(keys))
     distance[~edge] = triangle_distances(x[one[~edge, 0]], x[other[~edge]])

@@ -5,10 +5,6 @@ Known tips come from an independent float64 prototype, converged to 1e-12.
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +15,7 @@ import pytest
 import torch
 from cases import beam, beam_tip
 from runs import displacement, rounded_problem, simulator, state_of, tensor_of
+from simd_steps import alone_and_in_a_batch, own_simd, results_with
 from stretch_cases import KINDS, LIMITED_BEAM, VOLUME_BEAM, limited_beam, small_body, volume_beam
 
 import torchpd as pd
@@ -128,47 +125,12 @@ def test_damping_takes_energy_and_keeps_momentum() -> None:
     assert left[1] < 0.05 * left[0]
 
 
-PROGRAM = """
-import json, sys
-import torch
-sys.path[:0] = json.loads(sys.argv[1])
-from runs import simulator, state_of
-from stretch_cases import KINDS, small_body
-import torchpd as pd
-same = []
-for kind in KINDS:
-    case = small_body(kind)
-    sim = simulator(case, torch.float32, iterations=12)
-    one = state_of(case, sim)
-    scale = torch.linspace(0.5, 1.5, 19)[:, None, None]
-    together = pd.State(one.positions * (0.8 + 0.2 * scale), one.velocities * scale)
-    track = sim.rollout(together, 2)
-    for item in range(19):
-        alone = sim.rollout(pd.State(*(t[item : item + 1] for t in together)), 2)
-        same.append(torch.equal(alone.velocities[:, 0], track.velocities[:, item]))
-    same.append(bool(torch.isfinite(track.velocities).all()))
-print(json.dumps({"simd": pd._C.build_info()["simd"], "same": same}))
-"""
-
-
-@pytest.mark.parametrize("simd", [None, "avx2"])
-def test_same_bits_alone_and_in_a_batch(simd: str | None) -> None:
+@pytest.mark.parametrize("simd", sorted({own_simd(), "avx2"}))
+def test_same_bits_alone_and_in_a_batch(simd: str) -> None:
     """19 environments fill packs of environments and leave lanes over; alone, packs hold elements."""
-    if simd is not None and simd not in pd._C.build_info()["simd_available"]:
+    if simd not in pd._C.build_info()["simd_available"]:
         pytest.skip(f"this machine has no {simd}")
-    paths = json.dumps([str(HELPERS), str(HELPERS / "elements"), str(Path(pd.__file__).parents[1])])
-    own = {} if simd is None else {"TORCHPD_SIMD": simd}
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, paths],
-        env={**os.environ, **own},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert simd is None or found["simd"] == simd
-    assert all(found["same"])
+    assert all(results_with(simd, alone_and_in_a_batch))
 
 
 def test_a_scene_without_them_is_as_before() -> None:

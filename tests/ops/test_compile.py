@@ -91,19 +91,6 @@ def test_compiled_rollouts_of_any_length_are_two_graphs() -> None:
         assert set(calls) == {f"torchpd.{name}.default"}
 
 
-def test_inductor_takes_rollouts_of_permuted_arrays() -> None:
-    """Whose gradients are laid out as their fakes say."""
-    sim, state = small(torch.float64, iterations=200)
-    x, f = (t.transpose(0, -1).contiguous().transpose(0, -1) for t in (state.positions, noise(state.positions)))
-    f.requires_grad_()
-
-    def loss(x: Tensor, f: Tensor) -> Tensor:
-        return sim.rollout(pd.State(x, state.velocities), 3, forces=f).positions.square().sum()
-
-    found, expected = (torch.autograd.grad(play(x, f), f)[0] for play in (torch.compile(loss, fullgraph=True), loss))
-    assert torch.allclose(found, expected, rtol=1e-9, atol=0.0)
-
-
 def test_compiled_rollouts_that_go_one_by_one() -> None:
     """Functions of the step number."""
     sim, state = small(torch.float64, iterations=200)

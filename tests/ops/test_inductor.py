@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 import torch
+import torch._inductor.config
 from devices import missing_gpu
 from on_gpu import DTYPES, bar
-from runs import noise, simulator, state_of
+from runs import noise, simulator, small, state_of
 from torch import Tensor
 
 import torchpd as pd
@@ -24,6 +25,13 @@ WAYS = (
     ("cuda", GRAPHS, "float32", "block"),
     ("cuda", GRAPHS, "float64", "stream"),
 )
+
+
+@pytest.fixture(autouse=True)
+def in_this_process() -> Iterator[None]:
+    """Else torch starts processes that compile beside this one, of which each imports torch."""
+    with torch._inductor.config.patch(compile_threads=1):
+        yield
 
 
 @pytest.mark.parametrize(("device", "mode", "precision", "kernel"), WAYS)
@@ -65,3 +73,16 @@ def test_inductor_changes_no_bit(device: str, mode: str, precision: str, kernel:
         counters = torch._dynamo.utils.counters["inductor"]
         assert counters["cudagraph_skips"] == 0
         assert counters["cudagraph_recorded_non_static_inputs"] > 0
+
+
+def test_inductor_takes_rollouts_of_permuted_arrays() -> None:
+    """Whose gradients are laid out as their fakes say."""
+    sim, state = small(torch.float64, iterations=200)
+    x, f = (t.transpose(0, -1).contiguous().transpose(0, -1) for t in (state.positions, noise(state.positions)))
+    f.requires_grad_()
+
+    def loss(x: Tensor, f: Tensor) -> Tensor:
+        return sim.rollout(pd.State(x, state.velocities), 3, forces=f).positions.square().sum()
+
+    found, expected = (torch.autograd.grad(play(x, f), f)[0] for play in (torch.compile(loss, fullgraph=True), loss))
+    assert torch.allclose(found, expected, rtol=1e-9, atol=0.0)

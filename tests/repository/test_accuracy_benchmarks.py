@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,11 +12,6 @@ import numpy as np
 import pytest
 import torch
 from programs import ROOT
-
-
-def run(script: str, *words: str) -> str:
-    command = [sys.executable, f"benchmarks/{script}", *words]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
 
 
 @pytest.fixture
@@ -85,11 +79,11 @@ def test_scenes_are_drawn_from_the_whole_range() -> None:
 
 
 @pytest.mark.usefixtures("on_path")
-def test_scenes_that_were_judged_are_kept(tmp_path: Path) -> None:
+def test_scenes_that_were_judged_are_kept(tmp_path: Path, script: Callable[..., str]) -> None:
     from tune import main
 
     out = tmp_path / "tune.json"
-    run("tune.py", "--scenes", "1", "--out", str(out))
+    script("benchmarks/tune.py", "--scenes", "1", "--out", str(out))
     first = json.loads(out.read_text())
     assert first["summary"]["scenes"] == 1
     assert first["command"] == f"python benchmarks/tune.py --scenes 1 --out {out.name}"
@@ -438,17 +432,17 @@ def test_what_a_gradient_costs() -> None:
     assert "| Chebyshev, multilevel adjoint made in 2 s |" in line_of({**row, "making": 2.0})
 
 
-def test_accuracy_by_kind_counts_iterations_and_draws(tmp_path: Path) -> None:
+def test_accuracy_by_kind_counts_iterations_and_draws(tmp_path: Path, script: Callable[..., str]) -> None:
     """Errors fall with the iterations to the smallest goal, and the picture is written beside the rows."""
     out = tmp_path / "rod.json"
-    said = run("accuracy_by_kind.py", "--scenes", "rod", "--seconds", "0", "--out", str(out))
+    said = script("benchmarks/accuracy_by_kind.py", "--scenes", "rod", "--seconds", "0", "--out", str(out))
     assert "rod, 1e7 Pa, Chebyshev" in said
     (row,) = json.loads(out.read_text())["rows"]
     points = row["solvers"]["Chebyshev"]["points"]
     assert points[0]["error"] > 0.5 > 1e-3 >= points[-1]["error"]
     assert row["auto"]["solver"] == "Chebyshev"
     assert row["default"]["error"] > 0.1
-    run("accuracy_by_kind.py", "--draw", str(out))
+    script("benchmarks/accuracy_by_kind.py", "--draw", str(out))
     assert out.with_suffix(".png").stat().st_size > 1000
 
 

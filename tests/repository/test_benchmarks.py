@@ -9,6 +9,7 @@ import re
 import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -140,28 +141,25 @@ def test_unknown_scene_is_refused(capsys: pytest.CaptureFixture[str], monkeypatc
     assert all(word in said for word in ("--only", "1k, 10k", "got nothing"))
 
 
-def test_beam_counts_iterations(tmp_path: Path) -> None:
+def test_beam_counts_iterations(tmp_path: Path, script: Callable[..., str]) -> None:
     """With 150 iterations at most, by which Jacobi comes to a hundredth and not to a thousandth."""
     words = ["--most", "150", "--errors", "0.1", "0.01", "0.001", "--out", str(tmp_path / "beam.json")]
-    command = [sys.executable, "benchmarks/beam.py", *words]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    said = script("benchmarks/beam.py", *words)
     rows = json.loads((tmp_path / "beam.json").read_text())["rows"]
     counts = {row["solver"]: row["iterations"] for row in rows if row["youngs"] == 1e4}
     assert counts["Jacobi"] == [41, 102, None]
     assert counts["guarded Chebyshev"][1:] == [22, 38]
     assert counts["classic Chebyshev"] == sorted(counts["classic Chebyshev"])
     assert counts["classic Chebyshev"][1] < 102 / 3
-    soft = next(line for line in result.stdout.splitlines() if "1e+04  Jacobi" in line)
+    soft = next(line for line in said.splitlines() if "1e+04  Jacobi" in line)
     assert soft.split()[-4:] == ["41", "102", ">", "150"]
 
 
-def test_multilevel_counts_iterations(tmp_path: Path) -> None:
+def test_multilevel_counts_iterations(tmp_path: Path, script: Callable[..., str]) -> None:
     """Of a box; the file has the rows."""
     out = tmp_path / "multilevel.json"
-    words = ["--cells", "3", "--youngs", "1e6", "--out", str(out)]
-    command = [sys.executable, "benchmarks/multilevel.py", *words]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    name, lbfgs, momentum, chebyshev = result.stdout.splitlines()
+    said = script("benchmarks/multilevel.py", "--cells", "3", "--youngs", "1e6", "--out", str(out))
+    name, lbfgs, momentum, chebyshev = said.splitlines()
     written = json.loads(out.read_text())
     assert [row["kind"] for row in written["rows"]] == ["steps"]
     assert [str(count) for count in written["rows"][0]["iterations"]["lbfgs"]] == lbfgs.split()[1:4]
@@ -173,10 +171,8 @@ def test_multilevel_counts_iterations(tmp_path: Path) -> None:
     assert chebyshev.split()[:4] == ["512", "iterations", "of", "guarded"]
 
 
-def test_multilevel_counts_iterations_with_stiff_pieces() -> None:
-    command = [sys.executable, "benchmarks/multilevel.py", "--blocks", "6", "--contrasts", "1e3"]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    slabs, *rows = result.stdout.splitlines()
+def test_multilevel_counts_iterations_with_stiff_pieces(script: Callable[..., str]) -> None:
+    slabs, *rows = script("benchmarks/multilevel.py", "--blocks", "6", "--contrasts", "1e3").splitlines()
     assert slabs.startswith("box 6, slabs at 1000: 1519 vertices")
     assert rows[1].startswith("box 6, cubes at 1000: 1519 vertices")
     for row in rows[::2]:
@@ -186,10 +182,9 @@ def test_multilevel_counts_iterations_with_stiff_pieces() -> None:
         assert counts[-1] < 40
 
 
-def test_newton_is_compared_with_multilevel(tmp_path: Path) -> None:
+def test_newton_is_compared_with_multilevel(tmp_path: Path, script: Callable[..., str]) -> None:
     out = tmp_path / "newton.json"
-    command = [sys.executable, "benchmarks/newton.py", "--scenes", "beam, 1e6 Pa", "--out", str(out)]
-    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    said = script("benchmarks/newton.py", "--scenes", "beam, 1e6 Pa", "--out", str(out)).splitlines()
     (row,) = json.loads(out.read_text())["rows"]
     assert row["vertices"] == 936
     for line, (name, solver) in zip(said, row["solvers"].items(), strict=True):
@@ -201,21 +196,19 @@ def test_newton_is_compared_with_multilevel(tmp_path: Path) -> None:
         assert counts[-1] < 40
 
 
-def test_set_up_times_every_stage(tmp_path: Path) -> None:
+def test_set_up_times_every_stage(tmp_path: Path, script: Callable[..., str]) -> None:
     out = tmp_path / "set-up.json"
-    command = [sys.executable, "benchmarks/set_up.py", "--cells", "3", "--plans", "4", "--out", str(out)]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert "256 vertices, 810 tetrahedra" in result.stdout
+    said = script("benchmarks/set_up.py", "--cells", "3", "--plans", "4", "--out", str(out))
+    assert "256 vertices, 810 tetrahedra" in said
     box, plans = json.loads(out.read_text())["rows"]
     assert list(box["stages"]) == ["simulator", "gpu plan", "levels", "gpu levels"]
     assert list(plans["stages"]) == ["simulator", "gpu plan"]
     assert all(stage["processor_seconds"] > 0.0 for stage in box["stages"].values())
 
 
-def test_body_contact_times_every_scene(tmp_path: Path) -> None:
+def test_body_contact_times_every_scene(tmp_path: Path, script: Callable[..., str]) -> None:
     out = tmp_path / "contact.json"
-    command = [sys.executable, "benchmarks/body_contact.py", "--cells", "2", "--steps", "2", "--out", str(out)]
-    subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    script("benchmarks/body_contact.py", "--cells", "2", "--steps", "2", "--out", str(out))
     rows = json.loads(out.read_text())["rows"]
     assert [row["scene"] for row in rows] == ["rest", "stack", "sheet", "apart"]
     assert [row["triangles"] for row in rows] == [48 + 72, 96, 48 + 288, 96]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import os
+import runpy
 import subprocess
 import sys
 import tarfile
@@ -57,10 +58,16 @@ def test_old_python(tmp_path: Path) -> None:
     assert "python >= 3.10 is needed" in failure("--version", modules=modules)
 
 
-@pytest.mark.parametrize("compiler", ["/nowhere/c++", "false"])
-def test_missing_compiler(compiler: str, tmp_path: Path) -> None:
-    sentence = failure("build_ext", "--build-lib", str(tmp_path), CXX=compiler)
-    assert f"`{compiler}` does not compile C++20; install g++" in sentence
+def test_missing_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """That fails, asked by a build, and that is not there."""
+    sentence = failure("build_ext", "--build-lib", str(tmp_path), CXX="false")
+    assert "`false` does not compile C++20; install g++" in sentence
+    monkeypatch.setattr(sys, "argv", ["setup.py", "--name"])
+    monkeypatch.chdir(ROOT)
+    check = runpy.run_path(str(ROOT / "setup.py"))["check_compiler"]
+    monkeypatch.setenv("CXX", "/nowhere/c++")
+    with pytest.raises(SystemExit, match=r"^torchpd cannot be built: `/nowhere/c\+\+` does not compile"):
+        check()
 
 
 DYNAMIC_SECTION = """

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,14 +28,12 @@ def recorded() -> list[dict[str, Any]]:
     return rows
 
 
-def test_fast_cases_hold_and_give_what_is_recorded(tmp_path: Path) -> None:
+def test_fast_cases_hold_and_give_what_is_recorded(tmp_path: Path, script: Callable[..., str]) -> None:
     """The script ends without an error beyond a bound; its numbers are those of the results, to rounding."""
     from validation import key_of
 
     out = tmp_path / "validation.json"
-    command = [sys.executable, "benchmarks/validation.py", "--quick", "--out", str(out)]
-    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert ended.returncode == 0, ended.stderr
+    script("benchmarks/validation.py", "--quick", "--out", str(out))
     result = json.loads(out.read_text())
     assert {"command", "created", "commit", "machine", "versions"} <= result.keys()
     known = {key_of(row): row["found"] for row in recorded()}

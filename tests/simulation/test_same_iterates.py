@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from runs import (
     arguments_of,
     displacement,
     ended_by_rounding,
-    first_of,
     reference_runs,
     residual_error,
     rounded_problem,
@@ -44,15 +44,32 @@ def tolerance_of(problem: StepProblem, displacement: Array, dtype: torch.dtype) 
     return max(TOLERANCE[dtype], ended_by_rounding(problem, displacement))
 
 
+@lru_cache(maxsize=1)
+def prepared(
+    case: Callable[[], Case], dtype: torch.dtype, device: torch.device
+) -> tuple[Case, StepProblem, pd.Simulator]:
+    """What a case is for every solver: tests of one follow each other."""
+    scene = case()
+    return scene, rounded_problem(scene, dtype), simulator(scene, dtype, device)
+
+
+@lru_cache(maxsize=2)
+def first_of_case(case: Callable[[], Case], dtype: torch.dtype, device: torch.device, *, weighted: bool) -> Array:
+    """The first iterate of the reference, which of a solver depends on its diagonal alone."""
+    scene, problem, _ = prepared(case, dtype, device)
+    first = problem.with_diagonal(weighted=weighted).first_iterate(scene.start)
+    first.setflags(write=False)
+    return first
+
+
 @pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_iterates_are_those_of_the_reference(
     case: Callable[[], Case], solver: pd.Jacobi | pd.Chebyshev, dtype: torch.dtype, device: torch.device
 ) -> None:
-    scene = case()
-    problem = rounded_problem(scene, dtype)
-    first = first_of(problem, scene, solver)
-    sim = simulator(scene, dtype, device, solver=solver)
+    scene, problem, sim = prepared(case, dtype, device)
+    first = first_of_case(case, dtype, device, weighted=solver.settings()["weighted"])
+    sim.solver = solver
     for expected in reference_runs(problem, first, solver, COUNTS):
         if np.abs(expected.displacement).max() > DIVERGED:
             break
