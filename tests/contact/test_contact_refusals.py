@@ -83,6 +83,15 @@ STEPS: dict[str, Callable[[], object]] = {
     r"history.poses must be \[1, 2, 7\], as rest_state\(\) has it, got \[1, 1, 7\]": lambda: SIM(
         with_history(poses=STATE.history.poses[:, :1])
     ),
+    "targets of a Collider must be a tensor of torch.float64 on cpu, got list; torch.as_tensor": lambda: SIM(
+        STATE, targets={LEFT: pose().tolist()}
+    ),
+    "targets of a Collider must be a tensor of .*got ndarray": lambda: SIM.rollout(
+        STATE, 2, targets=lambda step: {LEFT: pose().numpy()}
+    ),
+    r"targets must be \[0, 3\], .*got \[7\]; .*all pins, and a pose goes as \{collider: pose\}": lambda: SIM(
+        STATE, targets=pose()
+    ),
 }
 
 
@@ -192,6 +201,20 @@ def test_rounding_of_far_places() -> None:
         sim.to(torch.float32)
     assert sim.dtype == torch.float64
     sim(sim.rest_state())
+
+
+def test_a_body_that_touches_a_collider() -> None:
+    """A Tie joins bodies alone, so the fix names none."""
+    cube, table = pd.Solid(pd.shapes.box((0.1,) * 3, (1,) * 3), 1e5, 1e3), pd.Collider(plane(1.0, 1.0, 1))
+    with pytest.raises(ValueError, match=r"leave the thickness, 0\.001 m; a Pin .* follow it$"):
+        simulator(pd.Scene(cube, table, pd.Contact(thickness=THICKNESS)))
+
+
+def test_check_of_values() -> None:
+    state = STATE.clone()
+    state.velocities[0, 3, 1] = math.nan
+    with pytest.raises(ValueError, match="check: velocities must be finite, got others in environment 0"):
+        SIM.check(state)
 
 
 # ---- reports

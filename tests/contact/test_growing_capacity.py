@@ -99,6 +99,25 @@ def test_the_control_is_taken_back() -> None:
     assert int(info.contact_overflow) > 0
 
 
+def test_a_simulator_with_more_room_goes_on() -> None:
+    """From the state of one whose capacity was exceeded, with the bits of a wide history; less room is refused."""
+    few, many = simulator(stacked(4), 16), simulator(stacked(5000), 16)
+    with pytest.warns(pd.SceneWarning, match="taken back"):
+        narrow = few.rollout(starts(few, 2), 8).state()
+    assert narrow.history.keys.shape == (2, 4)
+    wide = starts(many, 2)._replace(positions=narrow.positions, velocities=narrow.velocities)
+    many.check(narrow)
+    after = many(narrow)
+    assert same(after, many(wide))
+    assert after.history.keys.shape == (2, 5000)
+    assert many.contact_forces(narrow, after).pairs.counts.min() > 0
+    for act in (few, few.check, few.step_):
+        with pytest.raises(ValueError, match=r"keys .* at most 4 pairs.*got \[2, 5000\]; .*Contact\(capacity=5000\)"):
+            act(after)
+    with pytest.raises(ValueError, match=r"step_: history\.keys must have room for 5000 pairs.*got \[2, 4\]; call"):
+        many.step_(narrow)
+
+
 @pytest.mark.filterwarnings("ignore::torchpd.SceneWarning")
 def test_rollouts_have_one_width() -> None:
     """Records before growth have room for as many pairs as later ones; a rollout goes on from any of them."""

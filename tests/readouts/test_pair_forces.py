@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -414,3 +416,21 @@ def test_what_is_refused(words: str, name: str) -> None:
     after: Any = REFUSED[words]()
     with pytest.raises((TypeError, ValueError), match=words):
         getattr(SIM, name)(BEFORE, after, targets=TARGETS)
+
+
+def test_keys_of_another_simulator(tmp_path: Path) -> None:
+    """A loaded one has parts of its own, as the error says."""
+    sim = gripped(torch.float64, 1)[0]
+    sim.save(tmp_path / "sim.safetensors")
+    loaded = pd.Simulator.load(tmp_path / "sim.safetensors")
+    state = loaded.rest_state()
+    contacts = loaded.contact_forces(state, loaded(state))
+    cube, left = loaded.scene.bodies[0], loaded.scene.colliders[0]
+    assert not contacts.between[cube, left].force.any()
+    for found, key, kinds in (
+        (contacts.between, (cube, sim.scene.colliders[0]), r"here 4: \(Solid, Collider\), \(Collider, Solid\); "),
+        (contacts.bodies, sim.scene.bodies[0], "here 3: Solid, Collider; got another Solid"),
+    ):
+        with pytest.raises(KeyError, match=rf"{kinds}.*load makes new bodies and colliders, sim\.scene\.bodies"):
+            found[key]  # type: ignore[index]
+    assert type(copy.deepcopy(contacts.bodies)) is type(contacts.bodies)

@@ -60,7 +60,17 @@ def friction_of(contact: pd.Contact, *others: Any) -> list[list[float]]:
             "Contact takes Solid, Cloth, Rod and Collider, got str; pass them one by one",
         ),
         (lambda: pd.Contact([SOLID]), TypeError, "Contact takes Solid, .*got list; pass them one by one"),
-        (lambda: pd.Contact(SOLID, pd.Ground()), TypeError, "Contact takes Solid, .*got Ground; pass them one by one"),
+        (
+            lambda: pd.Contact(SOLID, pd.Ground()),
+            TypeError,
+            r"Contact takes .*got Ground; .*Ground\(friction=\): leave",
+        ),
+        (lambda: pd.Contact(0.3), TypeError, r"Contact takes .*got float; .*by name, Contact\(friction=0\.3\)"),
+        (
+            lambda: pd.Contact(friction={(SOLID, pd.Sphere((0.0, 0.0, 0.0), 1.0)): 0.3}),
+            TypeError,
+            r"Contact\.friction takes .*got Sphere; .*coefficient is Sphere\(friction=\): leave it out",
+        ),
         (lambda: pd.Contact(SOLID, SOLID), ValueError, "each body must be given once, got the same Solid twice"),
         (lambda: pd.Contact(FLOOR), ValueError, "bodies must have one that deforms, .*got 1 colliders alone; name it"),
         (lambda: pd.Contact(thickness=0.0), ValueError, r"Contact\.thickness must be positive \[m\], got 0\.0; None"),

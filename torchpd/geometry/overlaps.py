@@ -21,6 +21,8 @@ Mask = NDArray[np.bool_]
 
 _PULL = 1e-3  # share of the distance from a corner to a centroid; shallower overlaps are not found
 
+_ROUNDING = 1e-9  # of barycentric coordinates, since vertices may lie on faces within a body
+
 
 class Overlap(NamedTuple):
     """Two bodies that overlap."""
@@ -59,7 +61,7 @@ def find_overlaps(meshes: Sequence[TetMesh | None], places: Sequence[Array] | No
 
 
 def boxes_meet(lows: Array, highs: Array) -> Mask:
-    """Whether some boxes overlap in each environment [B], by their corners [B, bodies, 3]; False for NaN."""
+    """Whether some boxes meet in each environment [B], by their corners [B, bodies, 3]; False for NaN."""
     found = np.zeros(len(lows), dtype=np.bool_)
     for first in range(lows.shape[1] - 1):
         found |= _overlap_of(first, lows, highs).any(axis=1)
@@ -67,14 +69,14 @@ def boxes_meet(lows: Array, highs: Array) -> Mask:
 
 
 def _overlap_of(first: int, lows: Array, highs: Array) -> Mask:
-    """Whether the box of one body overlaps those of later bodies [B, bodies - 1 - first]."""
+    """Whether the box of one body meets those of later bodies [B, bodies - 1 - first]."""
     later, one = slice(first + 1, None), slice(first, first + 1)
     low, high = np.maximum(lows[:, later], lows[:, one]), np.minimum(highs[:, later], highs[:, one])
-    return np.asarray((low < high).all(axis=-1))
+    return np.asarray((low <= high).all(axis=-1))
 
 
 def _near(lows: Array, highs: Array) -> Iterator[tuple[int, int]]:
-    """Pairs of bodies whose boxes overlap, by the corners of the boxes [bodies, 3]."""
+    """Pairs of bodies whose boxes meet, by the corners of the boxes [bodies, 3]."""
     for first in range(len(lows) - 1):
         for later in np.flatnonzero(_overlap_of(first, lows[None], highs[None])):
             yield first, first + 1 + int(later)
@@ -115,4 +117,4 @@ def _count_inside(points: Array, vertices: Array, tets: Index, low: Array, high:
         gradients, _ = shape_gradients(vertices, tets)
         weights = np.einsum("pak,pk->pa", gradients[tet], points[which] - corners[tet, 0])
         weights[:, 0] = 1.0 - weights[:, 1:].sum(axis=1)
-    return len(np.unique(which[weights.min(axis=1) > 0.0]))
+    return len(np.unique(which[weights.min(axis=1) > -_ROUNDING]))
