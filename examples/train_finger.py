@@ -47,8 +47,8 @@ def main() -> None:
         middle = (share[:, None] * end.positions[0]).sum(0)[[0, 2]]
         return (middle - goal).norm(), middle
 
-    optimiser = torch.optim.Adam([force], lr=0.04)
-    slower = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.88)
+    optimiser = torch.optim.Adam([force], lr=0.05)
+    slower = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.9)
     print("try   from the goal [mm]")
     for number in range(options.tries):
         optimiser.zero_grad()
