@@ -50,7 +50,9 @@ STEPS: dict[str, Callable[[], object]] = {
     'start must be "velocity" or "inertial" in a scene with Contact, got positions': lambda: SIM(
         STATE, start=STATE.positions
     ),
-    r"contact_friction must be \[\], \[3, 3\], .* of the 3 bodies and colliders, got \[2\]": lambda: setattr(SIM, "contact_friction", torch.ones(2)),
+    r"contact_friction must be \[\], \[3, 3\], .* of the 3 bodies and colliders, got \[2\]": lambda: setattr(
+        SIM, "contact_friction", torch.ones(2)
+    ),
     "contact_friction must be finite and >= 0, got -1": lambda: setattr(SIM, "contact_friction", -1.0),
     r"contact_friction must be the same for \(a, b\) and \(b, a\)": lambda: setattr(
         SIM, "contact_friction", torch.arange(9.0).reshape(3, 3)

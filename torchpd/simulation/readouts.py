@@ -36,6 +36,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..common.by_part import ByPart
 from ..common.reprs import by_sizes
 from ..common.small_matrices import dot, inverse, length, product
 from ..common.tables import PLANES, SPHERES
@@ -47,7 +48,6 @@ from ..scene.effects import Ground, Pin, Sphere
 from ..scene.part import Body
 from ..scene.scene import Scene
 from ..scene.tie import Tie
-from .by_part import ByPart
 from .pair_forces import Met, PairForces, empty_pairs
 from .stencil_readouts import forces_of_ties
 from .wrenches import Loaded, Wrench, between, loaded_bodies, loaded_colliders, wrench, wrenches
