@@ -17,7 +17,7 @@ from stretch_cases import KINDS, small_body
 
 import torchpd as pd
 
-HELPERS = Path(__file__).resolve().parent
+FILE = Path(__file__).resolve()
 
 
 def own_simd() -> str:
@@ -60,9 +60,9 @@ def results_with(simd: str, function: Callable[[], Any]) -> Any:
     """What the function gives with these instructions, in this process if it has them."""
     if simd == own_simd():
         return function()
-    paths = os.pathsep.join(map(str, (HELPERS / "elements", Path(pd.__file__).parents[1])))
+    paths = os.pathsep.join(map(str, (FILE.parents[1], Path(pd.__file__).parents[1])))
     done = subprocess.run(
-        [sys.executable, str(HELPERS / "simd_steps.py"), function.__name__],
+        [sys.executable, str(FILE), function.__name__],
         env={**os.environ, "TORCHPD_SIMD": simd, "PYTHONPATH": paths},
         capture_output=True,
         text=True,
