@@ -306,7 +306,7 @@ def test_too_many_pairs() -> None:
     arrays = [sizes, *sim.body_contact.arrays[1:]]
     x = saved.after.to(GPU)
     inertia = torch.ones(x.shape[1], dtype=torch.float64, device=GPU)
-    pairs = [x, x, saved.poses.to(GPU), saved.poses.to(GPU), keys.to(GPU), many.to(GPU), *arrays]
+    pairs = [x, x, *[saved.poses.to(GPU)] * 3, keys.to(GPU), many.to(GPU), *arrays]
     with pytest.raises(NotImplementedError, match="1000000 pairs"):
         torch.ops.torchpd.contact_conjugate(
             x, x, inertia, inertia, None, sim.material(), plan_of(sim), None, None, pairs, tolerance=1e-3, time_step=H

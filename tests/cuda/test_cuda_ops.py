@@ -235,8 +235,8 @@ def test_a_step_is_one_launch(kernel: str, precision: str) -> None:
     # torch's own kernels make the columns of the report that every track carries
     assert len(ours(device_work(lambda: sim.rollout(state, 20)))) == 1
     # the report is a pass of its own: u, three fields with their weights, vertices, their sums; then whole numbers,
-    # `converged` and two constants of scenes without Contact
-    assert len(device_work(lambda: sim(state, return_info=True))) <= 1 + 9 + 4
+    # `converged` and the three constants of scenes without Contact
+    assert len(device_work(lambda: sim(state, return_info=True))) <= 1 + 9 + 5
 
 
 @pytest.mark.parametrize("cells", [(2, 2, 2), (8, 5, 5)])

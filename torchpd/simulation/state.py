@@ -294,8 +294,7 @@ class Info(NamedTuple):
         inverted = whole[0] if whole else torch.full_like(iterations, -1)
         of_step = residual, energy, iterations, restarts, converged.bool(), rho, inverted
         if len(counted) < 4:
-            none = torch.zeros_like(iterations)
-            return cls(*of_step, torch.full_like(rho, math.inf), none, none.view(rho.dtype))
+            return cls(*of_step, torch.full_like(rho, math.inf), torch.zeros_like(iterations), torch.zeros_like(rho))
         return cls(*of_step, counted[1], whole[2], counted[3])
 
     def __repr__(self) -> str:

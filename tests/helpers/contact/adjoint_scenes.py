@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
 
@@ -13,7 +13,6 @@ from body_scenes import THICKNESS, H, block, cloth, gravity, plane, rotation, si
 from torch import Tensor
 
 import torchpd as pd
-from torchpd.ops.fake_kernels import CONTACT_FRICTION, CONTACT_THICKNESS
 from torchpd.reference import step_problem
 from torchpd.reference.contact.adjoint import ContactGradients, SolvedContact, contact_adjoint
 from torchpd.reference.contact.surfaces import Pairs
@@ -32,41 +31,31 @@ class Step:
 
     def inputs(self) -> dict[str, Tensor]:
         """What the step depends on, by name."""
-        contact, sim = self.sim.body_contact, self.sim
-        assert contact is not None
-        start = self.state.history.poses
+        sim, start = self.sim, self.state.history.poses
         given = {
             "positions": self.state.positions,
             "velocities": self.state.velocities,
             "forces": torch.zeros_like(self.state.positions),
             "start": start,
             "end": start.clone() if self.poses is None else self.poses.expand_as(start).clone(),
-            "contact_friction": contact.arrays[CONTACT_FRICTION],
-            "contact_thickness": contact.arrays[CONTACT_THICKNESS],
+            "contact_friction": sim.contact_friction,
+            "contact_thickness": sim.contact_thickness,
             **{name: getattr(sim, name) for name in sim.material_names},
         }
         return {name: value.detach().clone() for name, value in given.items() if value.numel() > 0}
 
     def run(self, inputs: dict[str, Tensor], **options: Any) -> Any:
         """The state after the step."""
-        contact, sim = self.sim.body_contact, self.sim
-        assert contact is not None
-        arrays = list(contact.arrays)
-        arrays[CONTACT_FRICTION], arrays[CONTACT_THICKNESS] = inputs["contact_friction"], inputs["contact_thickness"]
-        history = self.state.history
+        sim, history = self.sim, self.state.history
         if "start" in inputs:
             history = history._replace(poses=inputs["start"])
         state = pd.HistoryState(inputs["positions"], inputs["velocities"], history)
         targets = {part: inputs["end"][:, number] for number, part in enumerate(self.colliders)}
-        material = {name: inputs[name] for name in sim.material_names if name in inputs}
-        kept = sim.body_contact
-        try:
-            sim.body_contact = replace(contact, arrays=arrays)
-            return torch.func.functional_call(
-                sim, material, (state,), {"forces": inputs["forces"], "targets": targets or None, **options}
-            )
-        finally:
-            sim.body_contact = kept
+        names = (*sim.material_names, "contact_friction", "contact_thickness")
+        given = {name: inputs[name] for name in names if name in inputs}
+        return torch.func.functional_call(
+            sim, given, (state,), {"forces": inputs["forces"], "targets": targets or None, **options}
+        )
 
     def loss(self, inputs: dict[str, Tensor]) -> Tensor:
         """A fixed random function of all that the step moves."""

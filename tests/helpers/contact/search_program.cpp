@@ -65,8 +65,8 @@ int main() {
   }
   for (int n = 0; n < plan.points; ++n) a.surface[plan.point[n]] = 1;
   *a.numbers = {};
-  const ContactEnvironment<double> env{plan,    a,       {},      {},     nullptr,
-                                       nullptr, nullptr, nullptr, nullptr};
+  const ContactEnvironment<double> env{plan,    a,       {},      {},      nullptr,
+                                       nullptr, nullptr, nullptr, nullptr, plan.friction};
   const ContactSearch<double> search(env);
   const SerialTeam team;
   search.begin(team);
