@@ -142,13 +142,13 @@ def on_gpu(step: Step, dtype: torch.dtype = torch.float64) -> pd.Simulator:
 def test_the_gradients_of_the_cpu(name: str) -> None:
     """The same state, pairs and forces: to 1e-9, ten times the residual at which both solves stop.
 
-    Only sums have another order. For the pressed cubes to 1e-8: an ulp of the places changes their gradients by 8e-10
-    on the CPU. Pins whose target bodies keep them from have no gradient on either.
+    Only sums have another order. For the pressed cubes and the cloth to 1e-8: an ulp of the places changes their
+    gradients by 8e-10 and 3e-9 on the CPU. Pins whose target bodies keep them from have no gradient on either.
     """
     saved = Saved.of(STEPS[name]())
     sim = on_gpu(saved.step)
     wanted, found = saved.gradients(saved.step.sim), saved.gradients(sim)
-    least = 1e-8 if name == "pressed cubes" else 1e-9
+    least = 1e-8 if name in ("pressed cubes", "cloth over a cube") else 1e-9
     most = {key: relative(found[key], wanted[key]) for key in wanted if wanted[key].any()}
     assert max(most.values()) <= least, most
     assert all(not found[key].any() for key in wanted if not wanted[key].any())
