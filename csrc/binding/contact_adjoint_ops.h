@@ -162,9 +162,9 @@ struct WideSystem {
 
 // Gradients for positions, velocities and forces [batch, vertices, 3], for the poses of colliders at the end and at the
 // start [batch, colliders, 7], for the friction of bodies, the thickness of contact and the masses of colliders, then for
-// the wanted arrays of the material. `history`: poses before and after the step, keys and forces of pairs after it; `pushes`: forces between
-// bodies [batch, all vertices, 3]. An environment that was taken back passes gradients on to its state. What bodies hold
-// back from its target has no gradient.
+// the wanted arrays of the material. `history`: poses before and after the step, keys and forces of pairs after it;
+// `pushes`: forces between bodies [batch, all vertices, 3]. An environment that was taken back passes gradients on to its
+// state. What bodies hold back from its target has no gradient.
 template <class Backend>
 std::vector<Tensor> contact_step_vjp(const Tensor& grad_positions, const Tensor& grad_velocities,
                                      const Tensor& grad_poses, const Tensor& after,

@@ -85,6 +85,99 @@ def test_of_each_environment() -> None:
         sim(many)
 
 
+def test_a_trained_table_stays_symmetric_and_is_loaded() -> None:
+    sim, state = sliding()
+    sim.contact_friction = nn.Parameter(torch.full((2, 2), 0.3, dtype=torch.float64))
+    optimizer = torch.optim.SGD(sim.parameters(), lr=1.0)
+    way(sim, state).sum().backward()
+    optimizer.step()
+    table = sim.contact_friction.detach()
+    assert table[0, 1] == table[1, 0]
+    assert table[0, 1] != 0.3
+    other, _ = sliding()
+    other.load_state_dict(sim.state_dict())
+    assert torch.equal(way(other, state), way(sim, state))
+
+
+@pytest.mark.parametrize("name", ["contact_friction", "contact_thickness"])
+def test_a_state_dict_is_loaded_whole_or_not_at_all(name: str) -> None:
+    sim, _ = sliding()
+    given = {key: value.clone() for key, value in sim.state_dict().items()}
+    given["stiffness"] *= 2.0
+    given[name].fill_(-1.0)
+    before = {key: value.clone() for key, value in sim.state_dict().items()}
+    with pytest.raises(ValueError, match=rf"{name} must be .*got -1"):
+        sim.load_state_dict(given)
+    assert all(torch.equal(value, before[key]) for key, value in sim.state_dict().items())
+
+
+@pytest.mark.parametrize("kind", ["buffer", "parameter"])
+def test_another_shape_is_loaded(kind: str) -> None:
+    sim, _ = sliding()
+    other, _ = sliding()
+    other.contact_friction = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)[:, None, None]
+    own = torch.full((2, 2), 0.5, dtype=torch.float64)
+    sim.contact_friction = nn.Parameter(own) if kind == "parameter" else own.requires_grad_()
+    with pytest.warns(UserWarning, match="a new tensor for contact_friction"):
+        sim.load_state_dict(other.state_dict())
+    assert sim.contact_friction.requires_grad
+    assert torch.equal(sim.contact_friction.detach(), other.contact_friction)
+    assert len(sim.rest_state().positions) == 3
+
+
+def test_files_keep_parameters(tmp_path: Path) -> None:
+    sim, _ = sliding()
+    sim.contact_friction = nn.Parameter(torch.tensor(0.1, dtype=torch.float64))
+    sim.save(tmp_path / "sim")
+    loaded = pd.Simulator.load(tmp_path / "sim")
+    assert "contact_friction" in dict(loaded.named_parameters())
+    assert loaded.contact_friction.requires_grad
+
+
+def test_a_number_overwrites_what_nobody_trains() -> None:
+    sim, _ = sliding()
+    place = sim.contact_friction.data_ptr()
+    sim.contact_friction = 0.25
+    assert sim.contact_friction.data_ptr() == place
+    assert bool((sim.contact_friction == 0.25).all())
+    mine = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
+    sim.contact_friction = mine
+    sim.contact_friction = 0.5
+    assert float(mine) == 0.1
+    sim.contact_thickness = nn.Parameter(torch.tensor(1e-3, dtype=torch.float64))
+    sim.contact_thickness = 2e-3
+    assert isinstance(sim.contact_thickness, nn.Parameter)
+    assert sim.body_contact is not None
+    assert float(sim.contact_thickness) == sim.body_contact.plan.thickness == 2e-3
+
+
+def test_a_parametrized_thickness_stays_on_the_host() -> None:
+    class Exp(nn.Module):
+        def forward(self, x: Tensor) -> Tensor:
+            return x.exp()
+
+        def right_inverse(self, x: Tensor) -> Tensor:
+            return x.log()
+
+    sim, _ = sliding(torch.float32)
+    nn.utils.parametrize.register_parametrization(sim, "contact_thickness", Exp())
+    assert float(sim.contact_thickness) == pytest.approx(1e-3, rel=1e-6)
+    sim = sim.double()
+    assert "contact_thickness" not in sim.state_dict()
+    assert sim.contact_thickness.dtype == torch.float64
+    sim.load_state_dict(sim.state_dict())
+    assert way(sim, sim.rest_state()).isfinite().all()
+
+
+@pytest.mark.parametrize("shape", [(2,), (1, 2), (2, 2, 1)])
+def test_a_call_with_another_shape_is_refused(shape: tuple[int, ...]) -> None:
+    sim, state = sliding()
+    with pytest.raises(
+        ValueError, match=rf"contact_friction must be \[\], \[2, 2\], .* got \[{shape[0]}"
+    ):
+        functional_call(sim, {"contact_friction": torch.ones(shape, dtype=torch.float64)}, (state,))
+
+
 @pytest.mark.parametrize("how", ["file", "state_dict", "copy"])
 def test_they_are_kept(how: str, tmp_path: Path) -> None:
     sim, state = sliding()

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..accuracy.tuning_result import TuningResult
 from ..common.checks import check_has_values
@@ -201,6 +201,7 @@ class Simulator(Stepper):
             choice=self.choice,
             material=material,
             contact=contact,
+            parameters=[name for name in contact if name in self._parameters],
             trained=[name for name, value in (material | contact).items() if value.requires_grad],
             reference=stored_reference(self.plan.arrays) if has_preconditioner(self.plan.arrays) else None,
         )
@@ -223,7 +224,7 @@ def _restored(saved: SavedSimulation) -> Simulator:
     left_out = {"rest_curvature"} if flat else set()
     sim.set_material(**{name: array for name, array in saved.material.items() if name not in left_out})
     for name, value in saved.contact.items():
-        setattr(sim, name, value)
+        setattr(sim, name, nn.Parameter(value, requires_grad=False) if name in saved.parameters else value)
     for name in set(saved.trained) - left_out:
         getattr(sim, name).requires_grad_()
     reference = saved.reference

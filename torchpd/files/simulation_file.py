@@ -84,6 +84,7 @@ class SavedSimulation:
     choice: Choice | None  # of solver="auto", which chooses again on another device
     material: dict[str, Tensor]  # arguments of `set_material` by name
     contact: dict[str, Tensor]  # friction and thickness of `Contact` by name
+    parameters: list[str]  # those that are parameters
     trained: list[str]  # names of arrays that require a gradient
     reference: tuple[Tensor, Tensor] | None  # stiffness and inertia for which a preconditioner was made
 
@@ -121,6 +122,7 @@ def save_simulation(saved: SavedSimulation, path: str | Path) -> None:
         "parts": [_part_record(part, scene, meshes) for part in scene.parts],
         "material": list(saved.material),
         "contact": list(saved.contact),
+        "parameters": saved.parameters,
         "trained": saved.trained,
     }
     save_file(tensors, target, metadata={_KEY: json.dumps(record)})
@@ -298,6 +300,7 @@ def _saved(record: Record, tensors: _Tensors) -> SavedSimulation:
         choice=Choice(**choice) if choice else None,
         material=material,
         contact={name: tensors[name] for name in record.get("contact", ())},  # absent in older files
+        parameters=record.get("parameters", []),
         trained=record["trained"],
         reference=reference,
     )

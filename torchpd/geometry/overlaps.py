@@ -32,7 +32,7 @@ class Overlap(NamedTuple):
     points: int  # points of either that lie inside the other
 
 
-def find_overlaps(meshes: Sequence[TetMesh | None], places: Sequence[Array] | None = None) -> list[Overlap]:
+def find_overlaps(meshes: Sequence[TetMesh | None], places: Sequence[Array]) -> list[Overlap]:
     """Pairs of bodies of which one has points inside the other.
 
     The points of a solid are corners and centroids of tets behind the surface, those of surfaces and rods are their
@@ -41,10 +41,8 @@ def find_overlaps(meshes: Sequence[TetMesh | None], places: Sequence[Array] | No
 
     Args:
         meshes: of the bodies; None for surfaces and rods, which have no inside.
-        places: their vertices [V, 3] m; by default those of the meshes.
+        places: their vertices [V, 3] m.
     """
-    if places is None:
-        places = [mesh.vertices for mesh in meshes if mesh is not None]
     lows, highs = (np.stack([end(place, axis=0) for place in places]) for end in (np.min, np.max))
     found = []
     for first, second in _near(lows, highs):

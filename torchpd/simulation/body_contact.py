@@ -68,16 +68,12 @@ class BodyContact:
         }
 
     def checked_friction(self, given: Any) -> Tensor:
-        """What `sim.contact_friction` may be set to, as a tensor; the one that was given if it is one already."""
+        """What `sim.contact_friction` is set to, as a tensor: the one that is given, or a number for all pairs."""
         bodies, like = len(self.plan.friction), self.arrays[CONTACT_FRICTION]
         value = _real("contact_friction", given, like.dtype, like.device)
         if not isinstance(given, Tensor) and value.dim() == 0:
             value = value.expand(bodies, bodies).clone()
-        shapes = f"[], [{bodies}, {bodies}], [B, 1, 1] or [B, {bodies}, {bodies}]"
-        if value.dim() == 1 or value.dim() > 3 or value.shape[-2:] not in ((), (1, 1), (bodies, bodies)):
-            raise ValueError(
-                f"contact_friction must be {shapes} of the {bodies} bodies and colliders, got {list(value.shape)}"
-            )
+        _check_shape(value, bodies)
         if value.device.type == "meta":
             return value
         if not bool((value.detach().isfinite() & (value.detach() >= 0.0)).all()):
@@ -89,8 +85,8 @@ class BodyContact:
             )
         return value
 
-    def with_thickness(self, given: Any, values: SceneValues) -> tuple[BodyContact, Tensor]:
-        """The same with what `sim.contact_thickness` is set to, and that as a tensor. `values`: those of the scene."""
+    def checked_thickness(self, given: Any) -> Tensor:
+        """What `sim.contact_thickness` is set to, as a tensor: the one that is given, or a number as [1]."""
         value = _real("contact_thickness", given, self.arrays[CONTACT_FRICTION].dtype, torch.device("cpu"))
         if value.numel() != 1:
             raise ValueError(
@@ -100,10 +96,16 @@ class BodyContact:
         number = check_scalar("contact_thickness", float(value.detach()))
         if number <= 0.0:
             raise ValueError(f"contact_thickness must be positive [m], got {number}")
+        return value if isinstance(given, Tensor) else value.reshape(1)
+
+    def with_thickness(self, thickness: Tensor, values: SceneValues) -> BodyContact:
+        """The same with the pairs that are closer than a checked thickness at rest. `values`: those of the scene."""
+        if bool(thickness.detach() == self.arrays[CONTACT_THICKNESS]):
+            return self
         assert values.contact is not None
-        own = replace(values.contact, thickness=number, capacity=self.plan.capacity)
+        own = replace(values.contact, thickness=float(thickness.detach()), capacity=self.plan.capacity)
         like = self.arrays[CONTACT_FRICTION]
-        return BodyContact._made(contact_plan(replace(values, contact=own)), like.dtype, like.device), value
+        return BodyContact._made(contact_plan(replace(values, contact=own)), like.dtype, like.device)
 
     @staticmethod
     def _made(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> BodyContact:
@@ -174,7 +176,7 @@ class BodyContact:
         wanted, time_step = history[0] if inputs.poses is None else inputs.poses.contiguous(), settings["time_step"]
         arrays, motion, rigid = list(self.arrays), before.motion, self.rigid
         bodies = len(self.plan.friction)
-        arrays[CONTACT_FRICTION] = friction.expand(*friction.shape[:-2], bodies, bodies).contiguous()
+        arrays[CONTACT_FRICTION] = _tables(friction, bodies)
         arrays[CONTACT_THICKNESS] = thickness.reshape(1)
         if rigid is not None:
             gravity = named_material(material)["gravity"]
@@ -263,6 +265,24 @@ def _arrays(plan: ContactPlan, dtype: torch.dtype, device: torch.device) -> list
     keys = torch.tensor(plan.near.keys, dtype=torch.int64)
     moved = [array.to(device) for array in (*map(whole, [*surfaces, *search]), keys, *map(real, reals))]
     return [sizes, *moved, real([plan.thickness])]
+
+
+def _check_shape(friction: Tensor, bodies: int) -> None:
+    if friction.dim() not in (0, 2, 3) or friction.shape[-2:] not in ((), (1, 1), (bodies, bodies)):
+        raise ValueError(
+            f"contact_friction must be [], [{bodies}, {bodies}], [B, 1, 1] or [B, {bodies}, {bodies}] of the {bodies} "
+            f"bodies and colliders, got {list(friction.shape)}"
+        )
+
+
+def _tables(friction: Tensor, bodies: int) -> Tensor:
+    """Symmetric tables [Q, Q] or [B, Q, Q], so that gradients are the same for (a, b) and (b, a)."""
+    _check_shape(friction, bodies)
+    if friction.dim() == 3 and len(friction) == 1:
+        friction = friction[0]
+    if friction.dim() > 0:
+        friction = 0.5 * (friction + friction.mT)
+    return friction.expand(*friction.shape[:-2], bodies, bodies).contiguous()
 
 
 def _real(name: str, given: Any, dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -143,14 +143,37 @@ class Configured(Planned, nn.Module):
         self._reconfigure(adjoint=adjoint)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """As `torch.nn.Module`; what `Contact` reads is checked, and may be a number."""
-        if name in CONTACT_TENSORS and (contact := self.body_contact) is not None:
-            if name == "contact_friction":
-                checked = contact.checked_friction(value)
-            else:
-                self.body_contact, checked = contact.with_thickness(value, self.scene.values())
-            value = checked
+        """As `torch.nn.Module`; what `Contact` reads is checked. A number overwrites what no caller trains."""
+        if name in CONTACT_TENSORS and self.body_contact is not None:
+            checked = self._checked_contact(name, value)
+            own = getattr(self, name)
+            if not isinstance(value, Tensor) and (isinstance(own, nn.Parameter) or not own.requires_grad):
+                with torch.no_grad():
+                    own.copy_(checked if checked.shape == own.shape else checked.flatten()[0])
+                checked = own
+            super().__setattr__(name, checked)
+            self._find_near_pairs()
+            return
         super().__setattr__(name, value)
+
+    def _checked_contact(self, name: str, value: Any) -> Tensor:
+        """What friction or thickness of `Contact` is set to, as a tensor."""
+        contact = self._contact(name)
+        if name == "contact_friction":
+            return contact.checked_friction(value)
+        checked = contact.checked_thickness(value)
+        contact.with_thickness(checked, self.scene.values())  # refuses what no surface can have
+        return checked
+
+    def _contact(self, name: str) -> BodyContact:
+        if self.body_contact is None:
+            raise ValueError(f"{name}: the scene must have a Contact, got none; add Contact()")
+        return self.body_contact
+
+    def _find_near_pairs(self) -> None:
+        """Let the plan of `Contact` follow its thickness."""
+        if self.body_contact is not None:
+            self.body_contact = self.body_contact.with_thickness(self.contact_thickness, self.scene.values())
 
     @property
     def compiled(self) -> Configuration:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ..common.synonyms import check_arguments
+from ..common.warn import warn_user
 from ..estimate.solver_choice import Choice
 from ..ops.diagonal import named_material
 from ..plan.compiled import persistent_tensors
@@ -33,6 +34,7 @@ from .material_update import (
     write_change,
 )
 from .notices import Notices, warn_of_scene
+from .parametrization import HostTensor
 from .settings import (
     check_contact,
     choose,
@@ -224,19 +226,36 @@ class Model(Configured):
         return super().load_state_dict(state_dict, strict, assign)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        own = self._contact_tensors()
-        for name in [name for name in own if prefix + name in state_dict]:
-            # a checked one of another shape; torch copies the values of all
-            if state_dict[prefix + name].shape != own[name].shape:
-                setattr(self, name, state_dict[prefix + name].clone())
-        load_material(self, state_dict, prefix, rest, self._replace_material, super()._load_from_state_dict)
-        for name, value in self._contact_tensors().items():
-            setattr(self, name, value)  # checks it, and finds which pairs are closer than the thickness at rest
+        given = {name: state_dict[prefix + name] for name in self._contact_tensors() if prefix + name in state_dict}
+
+        def replace_arrays(owner: str, arrays: Mapping[str, Tensor | float], *, assign: bool) -> None:
+            for name, value in given.items():
+                self._checked_contact(name, value)
+            self._replace_material(owner, arrays, assign=assign)
+            self._resize_contact(given)
+
+        load_material(self, state_dict, prefix, rest, replace_arrays, super()._load_from_state_dict)
+        self._find_near_pairs()
         self._refresh_pin_mask()
 
     def _contact_tensors(self) -> dict[str, Tensor]:
         """What is trained of `Contact`, by name."""
         return {} if self.body_contact is None else {name: getattr(self, name) for name in CONTACT_TENSORS}
+
+    def _resize_contact(self, given: Mapping[str, Tensor]) -> None:
+        """Make room for friction or thickness of another shape, whose values torch copies."""
+        for name, value in given.items():
+            own = getattr(self, name)
+            if value.shape == own.shape:
+                continue
+            new = own.detach().new_empty(value.shape)
+            kept: Tensor = nn.Parameter(new) if isinstance(own, nn.Parameter) else new
+            vars(self)["_parameters" if isinstance(own, nn.Parameter) else "_buffers"][name] = kept
+            if kept.requires_grad_(own.requires_grad).requires_grad:
+                warn_user(
+                    f"the simulator has a new tensor for {name}, because its shape changed. An existing optimiser "
+                    "still holds the former one: create the optimiser again"
+                )
 
     def check_state(self, state: State | HistoryState, *, forces: Tensor | None = None, fix: str = "") -> Tensor | None:
         """Check a state and forces; return the forces of every environment.
@@ -319,16 +338,12 @@ class Model(Configured):
                 new = moved(reconfigure(self.compiled, solver=Chebyshev()), wanted.dtype, wanted.device)
             else:
                 new = moved(self.compiled, wanted.dtype, wanted.device)
-            thickness = None if contact is None else self.contact_thickness
-            number = None if thickness is None else thickness.data
+            held = None if contact is None else HostTensor(self, "contact_thickness")
             super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
             self._take(new)
-            if contact is not None and thickness is not None and number is not None:
-                self.body_contact = contact  # whose thickness stays on the host
-                if isinstance(thickness, nn.Parameter):
-                    thickness.data = number.to(wanted.dtype)
-                else:
-                    self._buffers["contact_thickness"] = thickness.to(wanted.dtype)
+            if held is not None:
+                self.body_contact = contact
+                held.restore(wanted.dtype)
             if self.loads is not None:
                 self.loads = SurfaceLoads.of(self.scene, wanted.dtype, wanted.device)
             if loses_positions:

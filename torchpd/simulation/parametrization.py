@@ -9,9 +9,31 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import ParametrizationList, is_parametrized, type_before_parametrizations
 
-__all__ = ["apply_parametrization", "invert_parametrization", "parametrization", "plain_copy"]
+__all__ = ["HostTensor", "apply_parametrization", "invert_parametrization", "parametrization", "plain_copy"]
 
 _Module = TypeVar("_Module", bound=nn.Module)
+
+
+class HostTensor:
+    """A tensor of a module that stays on the host where the module moves, with its gradient."""
+
+    def __init__(self, module: nn.Module, name: str) -> None:
+        holder, self._name = module, name
+        if is_parametrized(module, name):
+            holder, self._name = parametrization(module, name), "original"
+        tensors = holder._parameters if self._name in holder._parameters else holder._buffers
+        self._tensors: dict[str, Tensor | None] = tensors  # type: ignore[assignment]
+        own = tensors[self._name]
+        assert own is not None
+        self._own, self._values, self._grad = own, own.data, own.grad if own.is_leaf else None
+
+    def restore(self, dtype: torch.dtype) -> None:
+        """Put it back after `Module._apply`, in this precision."""
+        if isinstance(self._own, nn.Parameter):
+            self._own.grad, self._own.data = None, self._values.to(dtype)
+            self._own.grad = None if self._grad is None else self._grad.to(dtype)
+        else:
+            self._tensors[self._name] = self._own.to(dtype)
 
 
 def parametrization(module: nn.Module, name: str) -> ParametrizationList:

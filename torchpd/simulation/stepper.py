@@ -40,11 +40,13 @@ class Stepper(Readable):
         A `State`, or a `HistoryState` in scenes with plastic solids or `Contact`.
 
         Args:
-            batch: environments; by default one for each environment of the material.
+            batch: environments; by default one for each environment of the material and of friction between bodies.
         """
-        count = (
-            environments_of_material(named_arrays(self)) if batch is None else check_whole("batch", batch, minimum=0)
-        )
+        if batch is None:
+            tables = [len(value) for value in self._contact_tensors().values() if value.dim() == 3]
+            count = max([environments_of_material(named_arrays(self)), *tables])
+        else:
+            count = check_whole("batch", batch, minimum=0)
         history = self.history_at_rest()
         if history is not None:
             check_environments("Simulator.rest_state: batch", count, {"flow": history.flow})

@@ -15,9 +15,8 @@
 
 namespace pd::inline PD_TARGET {
 
-// Share of the friction bound below which a tangential force sticks, and share of it that the slip
-// of one iteration would have to take back. A pair whose slip would take back
-// all of it slides.
+// Share of the friction bound below which a tangential force sticks, and share of it that the slip of one iteration would
+// have to take back. A pair whose slip would take back all of it slides.
 constexpr double pair_sticking = 1e-3;
 // Weights that are negative by less count as zero, so that a foot on the rim of a face is inside.
 constexpr double feature_tie = 1e-6;

@@ -8,10 +8,11 @@
 //   W / 2 |t|^2 + w . J w / 2 - W (c_goal - c) . t - torque . w,   torque = (1 + [u] / 2 + u u^T / 4) (L - J u).
 // What balances the torque takes that momentum: L_next = L - torque.
 // The prox of an iteration (solver/contact/prox.h) has t and w as six more unknowns, in this metric. So no momentum acts on
-// a collider: it is where its inertia and the forces of its pairs leave it. Each sweep solves for t and w of all colliders first,
-// with forces of pairs that follow them by beta, until they are still: then these forces balance their inertia. A pair of
-// two colliders couples them: conjugate gradients solve Newton's steps of all at once, with the 6 x 6 matrices of each. Pairs then take the motion
-// of their corners for given. A pair whose surfaces are near is active where the free motion would bring them too near.
+// a collider: it is where its inertia and the forces of its pairs leave it. Each sweep solves for t and w of all colliders
+// first, with forces of pairs that follow them by beta, until they are still: then these forces balance their inertia. A
+// pair of two colliders couples them: conjugate gradients solve Newton's steps of all at once, with the 6 x 6 matrices of
+// each. Pairs then take the motion of their corners for given. A pair whose surfaces are near is active where the free
+// motion would bring them too near.
 #pragma once
 #include "solver/contact/environment.h"
 #include "solver/contact/rigid_turn.h"
@@ -342,8 +343,8 @@ class RigidColliders {
     });
   }
 
-  // The force that a pair would have after a sweep by the radius of friction before it, and how it follows its corners. `guess`: all pairs hold both ways, so
-  // that the first step does not go deep.
+  // The force that a pair would have after a sweep by the radius of friction before it, and how it follows its corners.
+  // `guess`: all pairs hold both ways, so that the first step does not go deep.
   PD_HD void find_terms(const Row& row, bool guess) const {
     const auto vector = [&](int n) { return Vec3<T>{row[n], row[n + 1], row[n + 2]}; };
     Vec3<T> between = vector(Row::between);

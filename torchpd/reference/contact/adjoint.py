@@ -32,8 +32,9 @@ __all__ = ["ContactGradients", "SolvedContact", "contact_adjoint", "pair_frames"
 
 Array = NDArray[np.float64]
 
-STICKING = 1e-3  # shares of the friction bound: of the force below which a pair sticks, and of what its slip pulls; one
-# whose slip pulls more than the bound slides
+# Shares of the friction bound: of the force below which a pair sticks, and of what its slip pulls. One whose slip pulls
+# more than the bound slides.
+STICKING = 1e-3
 TIE = 1e-9  # relative: of equally close features the larger one counts
 PARALLEL = 0.05  # sine of the angle of two edges below which their closest points are frozen
 
