@@ -172,9 +172,7 @@ def test_a_parametrized_thickness_stays_on_the_host() -> None:
 @pytest.mark.parametrize("shape", [(2,), (1, 2), (2, 2, 1)])
 def test_a_call_with_another_shape_is_refused(shape: tuple[int, ...]) -> None:
     sim, state = sliding()
-    with pytest.raises(
-        ValueError, match=rf"contact_friction must be \[\], \[2, 2\], .* got \[{shape[0]}"
-    ):
+    with pytest.raises(ValueError, match=rf"contact_friction must be \[\], \[2, 2\], .* got \[{shape[0]}"):
         functional_call(sim, {"contact_friction": torch.ones(shape, dtype=torch.float64)}, (state,))
 
 
