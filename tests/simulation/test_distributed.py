@@ -9,24 +9,20 @@ from typing import Any
 import pytest
 import torch
 from programs import HELPERS
-from two_ranks import Falling, gradients, main, youngs
+from two_ranks import Falling, gradients, youngs
 
 import torchpd as pd
 
 
 @pytest.fixture(scope="module")
 def ranks(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, Any]]:
-    """What two processes found: this one is the first."""
-    folder, threads = tmp_path_factory.mktemp("ranks"), torch.get_num_threads()
-    command = [sys.executable, str(HELPERS / "two_ranks.py"), "1", str(folder)]
-    second = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    torch.set_num_threads(1)
-    try:
-        main(0, folder)
-    finally:
-        torch.set_num_threads(threads)
-        errors = second.communicate(timeout=120)[1]
-    assert second.returncode == 0, errors
+    """What two processes found."""
+    folder = tmp_path_factory.mktemp("ranks")
+    program = HELPERS / "two_ranks.py"
+    command = [sys.executable, str(program)]
+    runs = [subprocess.Popen([*command, str(rank), str(folder)], stderr=subprocess.PIPE, text=True) for rank in (0, 1)]
+    errors = [run.communicate(timeout=120)[1] for run in runs]
+    assert [run.returncode for run in runs] == [0, 0], errors
     return [torch.load(folder / f"{rank}.pt") for rank in (0, 1)]
 
 
