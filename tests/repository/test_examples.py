@@ -142,7 +142,8 @@ def test_train_distributed(tmp_path: Path) -> None:
     text = torchrun("train_distributed.py", "--environments", "6", "--steps", "4", "--updates", "20")
     first, last = (float(off) for off in re.findall(r"off by +(\S+) mm", text)[::2])
     assert last < first
-    (_, own, weights), (_, others, same) = re.findall(r"rank (\d): mean damping (\S+) 1/s, weights (-?\d+\.\d{6})", text)
+    # lines of the ranks may run into each other
+    (own, weights), (others, same) = re.findall(r"rank \d: mean damping (\S+) 1/s, weights (-?\d+\.\d{6})", text)
     assert own != others  # material of a rank's own environments
     assert weights == same  # one network
 
