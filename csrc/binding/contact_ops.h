@@ -112,7 +112,8 @@ ContactPlan<T> contact_plan_view(at::TensorList arrays, std::int64_t batch,
   TORCH_CHECK_VALUE(friction.sizes() == at::IntArrayRef({q, q}) ||
                         friction.sizes() == at::IntArrayRef({batch, q, q}),
                     "contact_friction must be [", q, ", ", q, "] or [", batch, ", ", q, ", ", q,
-                    "], of every pair of bodies, got ", describe(friction));
+                    "], of every pair of bodies, got ", describe(friction),
+                    "; sim.rest_state(N) makes a state of N environments");
   plan.friction = friction.const_data_ptr<T>();
   plan.friction_stride = friction.dim() == 3 ? q * q : 0;
   const std::int64_t rigid = rows_of_array(contact_rigid);

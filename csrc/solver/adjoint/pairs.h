@@ -5,39 +5,23 @@
 // restrict its rows. Colliders with a mass that leave their free motion have nodes of their own:
 // solver/adjoint/rigid_nodes.h.
 #pragma once
-#include "math/screw.h"
 #include "solver/adjoint/friction.h"
-#include "solver/adjoint/one_thread.h"
+#include "solver/adjoint/pair_nodes.h"
 #include "solver/adjoint/pair_rows.h"
-#include "solver/adjoint/pair_views.h"
 
 namespace pd::inline PD_TARGET {
 
-template <class T>
-PD_HD PairSizes pair_sizes(const LoadedPairs<T>& call) {
-  const ContactPlan<T>& plan = call.plan;
-  return {plan.body_vertices, plan.rigid ? plan.colliders : 0, plan.capacity, call.most,
-          plan.bodies};
-}
-
 // `Team`: as OneThread
 template <class T, class Team>
-class AdjointPairs {
+class AdjointPairs : public PairNodes<T, Team> {
  public:
-  using Place = Vec3<double>;
+  using Nodes = PairNodes<T, Team>;
+  using typename Nodes::Place;
 
   // `vertex_order`: the user's numbers of the nodes
   PD_HD AdjointPairs(const LoadedPairs<T>& call, const int* vertex_order, const Team& team,
                      const PairMemory& memory, std::int64_t environment)
-      : call_(call),
-        plan_(call.plan),
-        order_(vertex_order),
-        team_(team),
-        m_(memory),
-        environment_(environment),
-        count_(call.plan.body_vertices),
-        nodes_(int(pair_sizes(call).nodes())),
-        rows_(team, memory, nodes_) {}
+      : Nodes(call, vertex_order, team, memory, environment), rows_(team, memory, nodes_) {}
 
   // Reads the pairs. `inverse(i)`: a reference to 1 / D of a node, to whose D sliding pairs add.
   // `projector(i)`, `sliding(i)`: as in a ConjugateCall, or null. `provide(low, square)`: memory for
@@ -102,92 +86,11 @@ class AdjointPairs {
     });
   }
 
-  // The derivatives that remain, from the multiplier l of the step and nu of the rows.
-  template <class Read>
-  PD_CALLED void differentiate(const Read& read, double* nu, const PairGradients<T>& out) const {
-    const int pairs = m_.counts->pairs;
-    // in newtons and so on, from those of scaled rows
-    team_.each(m_.counts->rows, [&](int p) { nu[p] *= sqrt(m_.item[m_.of_item[p]].step); });
-    team_.each(4 * std::int64_t(pairs), [&](int n) {
-      const PairItem& item = m_.item[n / 4];
-      double l[12], end[3], start[3];
-      gather(item, read, l);
-      Place after[4], before[4];
-      corners(item, after, before);
-      for (int i = 0; i < 3; ++i) {
-        const int j = 3 * (n % 4) + i;
-        const PairSlope<double> slope(item.pair, after, before, false, j);
-        end[i] = start[i] = 0;
-        for (int c = 0; c < 12; ++c) {
-          end[i] += item.slopes.load[c][j] * l[c];
-          start[i] += slope.load[c] * l[c];
-        }
-        for (int k = 0; k < item.pair.rows(); ++k) {
-          end[i] += item.slopes.row[k][j] * nu[m_.first[n / 4] + k];
-          start[i] += slope.row[k] * nu[m_.first[n / 4] + k];
-        }
-      }
-      m_.part[n] = {end[0], end[1], end[2]};
-      m_.part_of_start[n] = {start[0], start[1], start[2]};
-    });
-    to_places(m_.part, call_.poses_after, out.end, out.poses_end);
-    to_places(m_.part_of_start, call_.poses_before, out.start, out.poses_start);
-    to_colliders(read, out);
-    to_friction(read, out.friction + environment_ * plan_.bodies * plan_.bodies);
-    team_.sums(
-        1, pairs,
-        [&](int, int n) {
-          const PairItem& item = m_.item[n];
-          return item.has_scene_thickness ? nu[m_.first[n]] : 0.0;
-        },
-        [&](int, double sum) { out.thickness[environment_] = T(sum); });
-  }
-
  private:
-  // ---- the pairs
+  using Nodes::at, Nodes::corners, Nodes::gather, Nodes::is_turn, Nodes::on_slot, Nodes::sum_of;
+  using Nodes::call_, Nodes::plan_, Nodes::order_, Nodes::team_, Nodes::m_;
+  using Nodes::environment_, Nodes::count_, Nodes::nodes_;
 
-  PD_HD static Place at(const T* p) { return {double(p[0]), double(p[1]), double(p[2])}; }
-
-  // of any vertex, by the places of bodies and the poses of colliders
-  PD_HD Place place(int v, const T* bodies, const T* poses) const {
-    if (v < count_) return at(bodies + 3 * (environment_ * count_ + v));
-    const T* const pose = poses + 7 * (environment_ * plan_.colliders + plan_.collider[v]);
-    return Pose<double>{at(pose), double(pose[3]), at(pose + 4)}.place(
-        at(plan_.local + 3 * std::int64_t(v - count_)));
-  }
-
-  PD_HD void corners(const PairItem& item, Place (&after)[4], Place (&before)[4]) const {
-    for (int a = 0; a < 4; ++a) {
-      after[a] = place(item.vertex[a], call_.after, call_.poses_after);
-      before[a] = place(item.vertex[a], call_.before, call_.poses_before);
-    }
-  }
-
-  template <class Read>
-  PD_HD void gather(const PairItem& item, const Read& read, double (&l)[12]) const {
-    for (int a = 0; a < 4; ++a) {
-      Place of = {0, 0, 0};
-      if (const int s = item.slot[a]; s >= 0) {
-        of = read(item.node[s]);
-        if (item.node[s] >= count_) of = of + cross(read(item.node[s + 1]), item.arm[a]);
-      }
-      l[3 * a] = of.x, l[3 * a + 1] = of.y, l[3 * a + 2] = of.z;
-    }
-  }
-
-  PD_HD bool is_turn(int node) const { return node >= count_ && (node - count_) % 2 != 0; }
-
-  // What forces at(corner) are on a slot.
-  template <class At>
-  PD_HD Place on_slot(const PairItem& item, int s, const At& at) const {
-    const int node = item.node[s], first = item.corner[s];
-    if (node < count_) return at(first);
-    const int end = first > 0 ? 4 : item.pair.edges ? 2 : 1;
-    Place sum = {0, 0, 0};
-    for (int a = first; a < end; ++a)
-      sum = sum + (is_turn(node) ? cross(item.arm[a], at(a)) : at(a));
-    return sum;
-  }
   PD_HD double slot_weight(const PairItem& item, int s) const {
     if (item.node[s] < count_) return absolute(item.pair.frame.weight[item.corner[s]]);
     // of all directions: arms turn to any
@@ -206,16 +109,6 @@ class AdjointPairs {
       if (vertex < 0) sum += absolute(item.pair.frame.weight[item.corner[s]]);
       for (int a = 0; vertex >= 0 && a < 4; ++a)
         if (item.vertex[a] == vertex) sum += absolute(item.pair.frame.weight[a]);
-    }
-    return sum;
-  }
-
-  PD_HD Place sum_of(int node, const Vec3<double>* part) const {
-    Place sum = {0, 0, 0};
-    for (int n = m_.start[node]; n < m_.start[node + 1]; ++n) {
-      const int number = m_.entry[n] / m_.slots;
-      sum = sum + on_slot(m_.item[number], m_.entry[n] % m_.slots,
-                          [&](int a) { return part[4 * number + a]; });
     }
     return sum;
   }
@@ -486,86 +379,6 @@ class AdjointPairs {
     return Mat3<double>{{at(p), at(p + 3), at(p + 6)}} * field;
   }
 
-  // ---- gradients
-
-  // Sums the parts of corners, by the places of bodies and the poses of colliders.
-  PD_HD void to_places(const Vec3<double>* part, const T* poses, T* bodies, T* to) const {
-    team_.each(count_, [&](int node) {
-      const Place sum = sum_of(node, part);
-      T* const own = bodies + 3 * (environment_ * count_ + order_[node]);
-      own[0] = T(sum.x), own[1] = T(sum.y), own[2] = T(sum.z);
-    });
-    team_.sums(
-        7 * std::int64_t(plan_.colliders), 4 * m_.counts->pairs,
-        [&](int n, int k) {
-          const int v = m_.item[k / 4].vertex[k % 4];
-          return v < count_ ? 0.0 : by_pose(n, v, part[k], poses);
-        },
-        [&](int n, double sum) { to[7 * environment_ * plan_.colliders + n] = T(-sum); });
-  }
-
-  // By number n of the poses, from the place of one vertex. With u = axis x p a vertex is at
-  // origin + p + 2 w u + 2 axis x u.
-  PD_HD double by_pose(int n, int v, const Place& g, const T* poses) const {
-    if (plan_.collider[v] != n / 7) return 0;
-    const T* const pose = poses + 7 * (environment_ * plan_.colliders + plan_.collider[v]);
-    const Place p = at(plan_.local + 3 * std::int64_t(v - count_)), axis = at(pose + 4),
-                u = cross(axis, p);
-    const double w(pose[3]);
-    const Place turned = 2.0 * (w * cross(p, g) + cross(u, g) + cross(p, cross(g, axis)));
-    const double own[7] = {g.x, g.y, g.z, 2 * dot(g, u), turned.x, turned.y, turned.z};
-    return own[n % 7];
-  }
-
-  // By the inputs of colliders that leave their free motion; adds to what their poses at the start have.
-  template <class Read>
-  PD_HD void to_colliders(const Read& read, const PairGradients<T>& out) const {
-    team_.each(plan_.rigid ? std::int64_t(rigid_inputs) * plan_.colliders : 0, [&](int n) {
-      const int c = n / rigid_inputs, input = n % rigid_inputs, node = count_ + 2 * c;
-      if (!(m_.inverse[node] > 0)) return;
-      const std::int64_t at = environment_ * plan_.colliders + c;
-      const double found = m_.rigid[c].gradient(input, read(node), read(node + 1));
-      const int pose = input - rigid_numbers;
-      if (pose < 0) {
-        out.rigid[rigid_numbers * at + input] = T(found);
-      } else {
-        T& to = pose < 7 ? out.poses_free[7 * at + pose] : out.poses_start[7 * at + pose - 7];
-        to = T(double(to) + found);
-      }
-    });
-  }
-
-  // f = lambda (n - mu s / |s|): column 0 of B less that of a smooth pair, over -mu
-  template <class Read>
-  PD_HD void to_friction(const Read& read, T* to) const {
-    team_.each(m_.counts->pairs, [&](int number) {
-      const PairItem& item = m_.item[number];
-      double l[12], work = 0;
-      gather(item, read, l);
-      for (int a = 0; a < 4; ++a) {
-        const Place normal = item.pair.frame.weight[a] * item.pair.frame.normal;
-        work += l[3 * a] * (item.slopes.column[0][3 * a] - normal.x) +
-                l[3 * a + 1] * (item.slopes.column[0][3 * a + 1] - normal.y) +
-                l[3 * a + 2] * (item.slopes.column[0][3 * a + 2] - normal.z);
-      }
-      const bool slides = item.pair.state == PairState::slides;
-      m_.along[number] = slides ? item.pair.normal_force * work / item.pair.friction : 0.0;
-    });
-    const std::int64_t tables = std::int64_t(plan_.bodies) * plan_.bodies;
-    team_.each(tables, [&](int n) { m_.friction[n] = 0; });
-    team_.once([&] {
-      for (int n = 0; n < m_.counts->pairs; ++n) m_.friction[m_.item[n].bodies] += m_.along[n];
-    });
-    team_.each(tables, [&](int n) { to[n] = T(m_.friction[n]); });
-  }
-
-  const LoadedPairs<T>& call_;
-  const ContactPlan<T>& plan_;
-  const int* order_;
-  const Team& team_;
-  const PairMemory& m_;
-  std::int64_t environment_;
-  int count_, nodes_;  // vertices of bodies; all
   PairRows<Team> rows_;
 };
 
