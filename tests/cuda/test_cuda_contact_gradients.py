@@ -21,12 +21,12 @@ from adjoint_scenes import (
     sticking_cube,
     vertex_on_triangle,
 )
-from body_scenes import H, pressed_cubes, simulator
+from body_scenes import H, pressed_cubes, simulator, slope
 from devices import require_gpu
 from on_gpu import GPU, relative
 from op_samples import OF_CONTACT, samples
 from runs import plan_of, settings_of
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._pytree import tree_map
 
 import torchpd as pd
@@ -238,6 +238,20 @@ def test_friction_of_each_environment() -> None:
         alone = way(sim, own)
         assert torch.equal(alone[0], together[number])
         assert torch.equal(torch.autograd.grad(alone.sum(), own)[0][0], found[number])
+
+
+def test_a_trained_thickness_of_a_moved_simulator() -> None:
+    """It stays on the host; d (height of the top) / d thickness = 1, once a cube rests: to 1e-6 after 20 steps."""
+    sim = simulator(slope(0.0, 0.0).scene, 128)
+    sim.contact_thickness = nn.Parameter(torch.tensor(1.2e-3, dtype=torch.float64))
+    sim = sim.to(GPU)
+    state: Any = sim.rest_state()
+    for _ in range(20):
+        state = sim(state)
+    assert isinstance(sim.contact_thickness, nn.Parameter)
+    assert sim.contact_thickness.device.type == "cpu"
+    (found,) = torch.autograd.grad(state.positions[0, :, 1].max(), sim.contact_thickness)
+    assert float(found) == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_step_that_is_taken_back() -> None:
