@@ -64,22 +64,27 @@ def test_a_call_may_have_its_own() -> None:
 
 
 def test_of_each_environment() -> None:
-    """Bits of each alone, and gradients of each alone."""
+    """Bits of each alone, and gradients of each alone over four steps: of one number for all pairs, and of tables."""
     sim, state = sliding()
-    values = [0.1, 0.3, 0.7]
-    sim.contact_friction = friction = torch.tensor(values, dtype=torch.float64)[:, None, None].requires_grad_()
+    values = torch.tensor([0.1, 0.3, 0.7], dtype=torch.float64)
     many = pd.HistoryState(
         *(array.expand(3, *array.shape[1:]).clone() for array in state[:2]),
         pd.ContactHistory(*(array.expand(3, *array.shape[1:]).clone() for array in state.history)),
     )
-    together = way(sim, many)
-    assert together[0] > together[1] > together[2]
-    (gradient,) = torch.autograd.grad(together.sum(), friction)
-    for number, value in enumerate(values):
-        sim.contact_friction = own = torch.tensor(value, dtype=torch.float64, requires_grad=True)
-        alone = way(sim, state)
-        assert torch.equal(alone[0], together[number])
-        assert torch.equal(torch.autograd.grad(alone.sum(), own)[0], gradient[number].sum())
+    for size in (1, 2):
+        friction = values[:, None, None].expand(3, size, size).clone().requires_grad_()
+        sim.contact_friction = friction
+        together = way(sim, many, 4)
+        assert together[0] > together[1] > together[2]
+        (gradient,) = torch.autograd.grad(together.sum(), friction)
+        for number in range(3):
+            of_all = friction.detach()[number]
+            for shape in ([1, size, size], [size, size], [] if size == 1 else [size, size]):
+                sim.contact_friction = own = of_all.reshape(shape).clone().requires_grad_()
+                alone = way(sim, state, 4)
+                assert torch.equal(alone[0], together[number])
+                (found,) = torch.autograd.grad(alone.sum(), own)
+                assert torch.equal(found.reshape(size, size), gradient[number]), (size, number, shape)
     sim.contact_friction = torch.ones(2, 1, 1, dtype=torch.float64)
     with pytest.raises(ValueError, match=r"must be \[2, 2\] or \[3, 2, 2\].* got .*\[2, 2, 2\].*rest_state\(N\)"):
         sim(many)

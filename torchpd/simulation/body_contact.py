@@ -278,11 +278,11 @@ def _check_shape(friction: Tensor, bodies: int) -> None:
 def _tables(friction: Tensor, bodies: int) -> Tensor:
     """Symmetric tables [Q, Q] or [B, Q, Q], so that gradients are the same for (a, b) and (b, a)."""
     _check_shape(friction, bodies)
-    if friction.dim() == 3 and len(friction) == 1:
-        friction = friction[0]
-    if friction.dim() > 0:
+    if friction.dim() > 0 and friction.shape[-1] > 1:
         friction = 0.5 * (friction + friction.mT)
-    return friction.expand(*friction.shape[:-2], bodies, bodies).contiguous()
+    tables = friction.expand(*friction.shape[:-2], bodies, bodies)
+    # last, so that gradients of several steps add up in the order of any batch
+    return (tables[0] if tables.dim() == 3 and len(tables) == 1 else tables).contiguous()
 
 
 def _real(name: str, given: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
