@@ -102,7 +102,7 @@ def test_steps_in_place_and_rollouts() -> None:
     assert same(rest.state(), whole.state())
     assert same(half.state(), whole.state(4))
     assert whole.info.contact_gap.shape == whole.info.held_back.shape == whole.info.contact_overflow.shape == (9, 1)
-    kept, info = state.clone(), torch.zeros(1, 10, dtype=torch.float64)
+    kept, info = state.clone(), torch.zeros(1, 12, dtype=torch.float64)
     for step in range(9):
         sim.step_(kept, targets=targets(step), info=info)
     assert same(kept, whole.state())
@@ -180,6 +180,29 @@ def test_the_same_bits_alone_and_in_a_batch(batch: int) -> None:
         assert same(sim.rollout(one_of(state, environment), 4).state(), one_of(ends[0], environment))
 
 
+def test_the_pairs_are_what_the_capacity_has_to_hold() -> None:
+    """A capacity of just as many gives the bits of a large one, and one less lacks one."""
+
+    def step(capacity: int) -> tuple[Any, pd.Info]:
+        scene, velocities = _cubes(capacity)
+        sim = simulator(scene, 16, dtype=torch.float32)
+        state: Any = sim.rest_state(3)
+        state.velocities[:] = velocities
+        return sim(state, return_info=True)
+
+    after, info = step(4000)
+    assert info.contact_pairs[[0, 2]].tolist() == info.contact_searches[[0, 2]].tolist() == [0, 0]
+    pairs = int(info.contact_pairs[1])
+    assert pairs > 0
+    assert int(info.contact_searches[1]) > 0
+    exact, info = step(pairs)
+    assert torch.equal(exact.positions, after.positions)
+    assert not info.contact_overflow.any()
+    with pytest.warns(pd.SceneWarning, match="Its step was taken back"):
+        _, info = step(pairs - 1)
+    assert info.contact_overflow.tolist() == [0, 1, 0]
+
+
 def test_an_overflow_takes_the_step_back() -> None:
     """Of that environment alone; the others have the bits that they have alone. It is said once, with the need."""
     scene, velocities = _cubes(1)
@@ -188,8 +211,10 @@ def test_an_overflow_takes_the_step_back() -> None:
     state.velocities[:] = velocities
     with pytest.warns(pd.SceneWarning, match=r"environment 1 has \d+ pairs .*Contact\(capacity=\d+\)"):
         after, info = sim(state, return_info=True)
+    assert sim.body_contact is not None
     assert int(info.contact_overflow[1]) > 0
     assert info.contact_overflow[[0, 2]].tolist() == [0, 0]
+    assert info.contact_pairs[1] == sim.body_contact.plan.capacity + info.contact_overflow[1]
     assert same(one_of(after, 1), one_of(state, 1))
     for environment in (0, 2):
         assert same(sim(one_of(state, environment)), one_of(after, environment))

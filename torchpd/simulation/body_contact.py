@@ -25,7 +25,7 @@ from .state import ContactHistory, HistoryState, State, widened
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_MISSING, _PINS_HELD_BACK, _UNBALANCED = 1, 2, 3  # columns in csrc/contact/views.h
+_MISSING, _PINS_HELD_BACK, _UNBALANCED, _PAIRS, _SHORTENED = 1, 2, 3, 4, 6  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 _CAPACITY = 2  # place among the sizes of the op
 _RIGID_NUMBERS = 13  # rigid_numbers in csrc/contact/views.h: filled in by steps, of scenes with such colliders alone
@@ -152,7 +152,7 @@ class BodyContact:
         plan: list[Tensor],
         settings: dict[str, Any],
     ) -> tuple[HistoryState, Tensor]:
-        """The next state, and rows [B, 10] for `Info.from_rows`.
+        """The next state, and rows [B, 12] for `Info.from_rows`.
 
         Args:
             state: a checked one, whose flow is in the material.
@@ -202,7 +202,8 @@ class BodyContact:
             held_back = torch.cat([held_back, held.double()], dim=1).amax(dim=1, keepdim=True)
         # the residual of other scenes would count forces between bodies as unbalanced
         unbalanced, gaps = numbers[:, _UNBALANCED : _UNBALANCED + 1], numbers[:, :_PINS_HELD_BACK]
-        rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back], dim=1)
+        found = numbers[:, _PAIRS:_SHORTENED]
+        rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back, found], dim=1)
         return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, motion, flow)), rows
 
     def surfaces(self, thickness: Tensor) -> ContactSurfaces:

@@ -261,6 +261,8 @@ class Info(NamedTuple):
         held_back: largest distance that a pinned vertex or a vertex of a `Collider` stays behind its target because
             bodies are in the way [m]. Of a `Collider` with a mass, how far its inertia and the forces of its pairs
             would still move it. 0 without `Contact`.
+        contact_pairs: most pairs near each other that a search of the step found, for `Contact.capacity`. 0 without.
+        contact_searches: searches for pairs. 0 where nothing came near, and without `Contact`.
     The residual is (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). Here r is the part of grad E [N] that
     neither pins nor contacts balance. f_i = a_i (u_i - s_i) is the force of inertia, weight and springs on vertex i,
     and e_i that of its elements. S x is the sum of stiffness times position (csrc/solver/report.h), so 4 eps |S x|
@@ -284,18 +286,21 @@ class Info(NamedTuple):
     contact_gap: Tensor = torch.tensor(math.inf)
     contact_overflow: Tensor = torch.tensor(0)
     held_back: Tensor = torch.tensor(0.0)
+    contact_pairs: Tensor = torch.tensor(0)
+    contact_searches: Tensor = torch.tensor(0)
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 10]; older files have 6 columns."""
+        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 12]; older files have 6 columns, or 10."""
         residual, energy, _, _, converged, rho, *counted = rows.unbind(-1)
         # one pass for all columns; what it makes of those that are no whole numbers is not read
         _, _, iterations, restarts, _, _, *whole = rows.long().unbind(-1)
         inverted = whole[0] if whole else torch.full_like(iterations, -1)
         of_step = residual, energy, iterations, restarts, converged.bool(), rho, inverted
+        none = torch.zeros_like(iterations)
         if len(counted) < 4:
-            return cls(*of_step, torch.full_like(rho, math.inf), torch.zeros_like(iterations), torch.zeros_like(rho))
-        return cls(*of_step, counted[1], whole[2], counted[3])
+            return cls(*of_step, torch.full_like(rho, math.inf), none, torch.zeros_like(rho), none, none)
+        return cls(*of_step, counted[1], whole[2], counted[3], *(whole[4:] or (none, none)))
 
     def __repr__(self) -> str:
         try:
