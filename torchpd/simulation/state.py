@@ -291,7 +291,7 @@ class Info(NamedTuple):
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 12]; older files have 6 columns, or 10."""
+        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 12]; older files have 6 or 10 columns."""
         residual, energy, _, _, converged, rho, *counted = rows.unbind(-1)
         # one pass for all columns; what it makes of those that are no whole numbers is not read
         _, _, iterations, restarts, _, _, *whole = rows.long().unbind(-1)
