@@ -151,16 +151,6 @@ def test_scenes_are_checked(parts: tuple[Any, ...], kind: type[Exception], messa
         pd.Scene(*parts)
 
 
-def test_patches_are_refused_by_name() -> None:
-    """Contact takes triangles; the surface of such a body is that of its patches."""
-    ball = pd.shapes.octopus(cells=16)
-    patches = pd.PatchBody(pd.FreeFormPatches.from_mesh(ball), 1e5, apex="prism")
-    for make in (lambda: pd.Contact(patches), lambda: pd.Scene(patches, pd.Contact())):
-        with pytest.raises(TypeError, match="Contact takes Solid, Cloth, Rod and Collider, got PatchBody; name those"):
-            make()
-    assert pd.Scene(patches, SHEET, pd.Contact(SHEET)).contact is not None
-
-
 def test_parts_keep_their_values() -> None:
     table = {(SOLID, SHEET): 0.3}
     contact = pd.Contact(SOLID, SHEET, friction=table)

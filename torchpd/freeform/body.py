@@ -31,7 +31,7 @@ class PatchBody(Solid):
     The energy of a constraint of four vertices is st v |G - R|^2, with G = Ds Dm^-1, R its nearest rotation and v its
     rest volume (Vyatkin and Dolgovesov 2023; st = w / 2 of `Solid`). The body's vertices are those of the patches, in
     their order, then the apexes. So pins, forces and targets of vertices 0..V-1 apply to the patches. Contacts act on
-    these vertices, not on the heights that quadrics add.
+    these vertices, and `Contact` on the triangles between them, not on the heights that quadrics add: see `rise`.
 
     "skeleton", for closed bodies: every patch has an apex inside. Patches that see an apex share it, and tetrahedra
     fill the space between, so that the constraints resist bending and change of volume.
@@ -65,7 +65,6 @@ class PatchBody(Solid):
     patch_of: Index  # [E] patch of each constraint, -1 between apexes
     transport: PatchTransport
     _layer: _Layer | None
-    has_surface = False  # its surface is that of the patches
 
     def __init__(
         self,
@@ -112,6 +111,19 @@ class PatchBody(Solid):
         """
         pose: PatchPose = self.transport(self.points(positions), fallback)
         return pose
+
+    def rise(self) -> float:
+        """How far the patches lie from their triangles, at most, by 15 points of each at rest [m]."""
+        steps = torch.arange(5, dtype=self.patches.vertices.dtype, device=self.patches.vertices.device) / 4.0
+        first, second = (line.reshape(-1) for line in torch.meshgrid(steps, steps, indexing="ij"))
+        inside = first + second <= 1.0
+        at = torch.stack([first, second, 1.0 - first - second], dim=1)[inside]
+        count = len(self.patches.triangles)
+        number = torch.arange(count, device=at.device).repeat_interleave(len(at))
+        samples = self.patches.samples(number, at.repeat(count, 1))
+        points, corners = self.patches.surface(samples).points, self.patches.vertices[self.patches.triangles.long()]
+        flat = (samples.barycentrics[:, :, None] * corners[number]).sum(dim=1)
+        return float((points - flat).norm(dim=1).max())
 
     def points(self, positions: Tensor) -> Tensor:
         """Patch vertices and apexes in the order of `transport`, from positions as for `pose`."""

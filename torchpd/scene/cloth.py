@@ -82,7 +82,6 @@ class Cloth(Body):
     grain: Array | None
     strain_limit: Array | None  # [F, 2]
     limit_stiffness: Array | None  # [F]
-    has_surface = True
 
     @check_arguments("Cloth")
     def __init__(

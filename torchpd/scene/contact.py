@@ -222,12 +222,10 @@ def can_touch(one: Member, other: Member) -> bool:
 
 
 def _check_member(name: str, body: object) -> None:
-    if isinstance(body, Collider) or (isinstance(body, Body) and body.has_surface):
+    if isinstance(body, Collider | Body):
         return
     kind = type(body).__name__
-    if isinstance(body, Body):
-        fix = "name those that take part, Contact(cloth, solid)"
-    elif isinstance(body, Ground | Sphere):
+    if isinstance(body, Ground | Sphere):
         fix = f"every vertex meets a {kind}, whose coefficient is {kind}(friction=): leave it out"
     elif isinstance(body, int | float):
         fix = f"a coefficient of friction goes by name, Contact(friction={body})"

@@ -104,7 +104,6 @@ class Solid(Body):
     limit_stiffness: Array | None  # [E]
     stiffness_damping: Array | float  # [E], or 0.0
     plastic: Plastic | None
-    has_surface = True
 
     @check_arguments("Solid")
     def __init__(

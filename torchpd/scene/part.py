@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import FrozenInstanceError
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -88,7 +88,6 @@ class Body(KeyPart, ABC):
     """A part with vertices: a body has a `mesh` with `vertices` [V, 3] m, its rest shape."""
 
     mesh: Any
-    has_surface: ClassVar[bool] = False  # whether `Contact` takes its mesh, by triangles or by segments
 
     @property
     @abstractmethod
@@ -98,6 +97,10 @@ class Body(KeyPart, ABC):
     @abstractmethod
     def masses(self) -> Array:
         """Lumped masses of the vertices [V] kg."""
+
+    def rise(self) -> float:
+        """How far its surface lies from the triangles that contact acts on, at most [m]."""
+        return 0.0
 
 
 def check_body(name: str, value: object) -> None:

@@ -60,7 +60,6 @@ class Rod(Body):
     density: Array
     bending: Array | None  # [N - 2], None: follows youngs and radius
     rest_curvature: Array  # [N - 2]
-    has_surface = True
 
     @check_arguments("Rod")
     def __init__(

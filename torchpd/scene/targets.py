@@ -165,10 +165,13 @@ class Anchors:
             length = value[..., 3:].norm(dim=-1, keepdim=True)
             # a GPU would have to wait for the values, and a traced step has none
             read = value.device.type == "cpu" and not torch.compiler.is_compiling()
-            if read and not bool(((length > 0.0) & value.isfinite()).all()):
+            good = ((length > 0.0) & value.isfinite()).all(dim=-1) if read else None
+            if good is not None and not bool(good.all()):
+                worst = int(good.reshape(-1).long().argmin())
+                where = f" in environment {worst}" if value.dim() > 1 else ""
                 raise ValueError(
                     "targets of a Collider must be finite poses (x, y, z, qw, qx, qy, qz) whose quaternion is not "
-                    f"zero, got {value.tolist()}; (1, 0, 0, 0) turns nothing"
+                    f"zero, got {value.reshape(-1, 7)[worst].tolist()}{where}; (1, 0, 0, 0) turns nothing"
                 )
             number = self.colliders[id(part)]
             pose = torch.cat([value[..., :3], value[..., 3:] / length], dim=-1).unsqueeze(-2)

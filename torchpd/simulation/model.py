@@ -147,7 +147,7 @@ class Model(Configured):
             self.register_buffer(PIN_HARD, hard)
             self.loads = SurfaceLoads.of(scene, dtype, self.device)
         self._refresh_pin_mask()
-        warn_of_scene(scene)
+        warn_of_scene(scene, 0.0 if self.body_contact is None else self.body_contact.plan.thickness)
         if self.loads is not None:
             warn_of_loads(self.compiled, self.loads)
         if device is not None:  # first, since "auto" chooses for it

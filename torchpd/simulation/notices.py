@@ -37,10 +37,14 @@ _NESTED = "one lies inside the other, where Contact keeps it: move them apart"
 _INVERTED, _MISSING = 6, 8  # columns of the rows of a report
 
 
-def warn_of_scene(scene: Scene) -> None:
-    """Warn of bodies that overlap at rest, and of planes and spheres that do not meet what looks as if they did."""
+def warn_of_scene(scene: Scene, thickness: float = 0.0) -> None:
+    """Warn of bodies that overlap at rest, and of surfaces that do not meet where it looks as if they did.
+
+    `thickness`: of `Contact` [m].
+    """
     _say_small_spheres(scene)
     _say_rigid(scene)
+    _say_rise(scene, thickness)
     _say_rest(scene)
 
 
@@ -73,6 +77,18 @@ def _say_rigid(scene: Scene) -> None:
         warn_user(
             f"Simulator: {names} and {rigid} Collider with a mass are in one scene, and pass through each other, since "
             "planes and spheres act on vertices of bodies alone. Take a Collider without a mass as the table",
+            SceneWarning,
+        )
+
+
+def _say_rise(scene: Scene, thickness: float) -> None:
+    """Contact acts on the triangles of free-form patches."""
+    rise = max((body.rise() for body in scene.bodies if _takes_part(scene, body)), default=0.0)
+    if rise > thickness:
+        warn_user(
+            f"Simulator: patches lie up to {rise:.2g} m from their triangles, on which Contact acts, and its thickness "
+            f"is {thickness:.2g} m: what is drawn may overlap or keep apart by the difference. Take more patches, or "
+            "draw the triangles",
             SceneWarning,
         )
 
