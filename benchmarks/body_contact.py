@@ -4,6 +4,7 @@
     stack    two cubes, one on the other, on the ground
     sheet    a cloth of .3 m falls over a cube and folds
     apart    two cubes that fall side by side and touch nothing
+    octopus  the body of `make demo` with 24 lattice cells (--cells 4) lands and bends; its arms may meet
 
 Without `Contact` bodies pass through each other, so only the rows of `apart` compare the same motion.
 
@@ -21,6 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from machine import describe_run, write_result
+from scipy.spatial.transform import Rotation
 
 import torchpd as pd
 
@@ -49,11 +51,22 @@ def sheet(cells: int) -> pd.Cloth:
     return pd.Cloth(level(0.3, 6 * cells, 0.11), youngs=1e5, thickness=1e-3, area_density=0.2, bending=1e-5)
 
 
+def octopus(cells: int) -> pd.Solid:
+    """1 m large, tilted, 0.25 m above the ground."""
+    shape = pd.shapes.octopus()
+    low, high = shape.bounds
+    tilt = Rotation.from_euler("zxy", [25.0, 20.0, 25.0], degrees=True).as_matrix()
+    placed = shape.translated(-(low + high) / 2.0).scaled(1.0 / float((high - low).max())).transformed(tilt)
+    mesh = pd.tetrahedralize(placed, cells=6 * cells).merged()
+    return pd.Solid(mesh.translated((0.0, 0.25 - float(mesh.bounds[0, 1]), 0.0)), youngs=3e4, density=1000.0)
+
+
 SCENES: dict[str, Callable[[int], list[Any]]] = {
     "rest": lambda cells: [cube(cells, THICKNESS), pd.Collider(level(0.6, 6, 0.0))],
     "stack": lambda cells: [cube(cells, 0.0), cube(cells, 0.1 + THICKNESS, 0.01), pd.Ground(friction=0.5)],
     "sheet": lambda cells: [cube(cells, 0.0), sheet(cells), pd.Ground(friction=0.5)],
     "apart": lambda cells: [cube(cells, 0.0), cube(cells, 0.0, 1.0)],
+    "octopus": lambda cells: [octopus(cells), pd.Ground(friction=0.5)],
 }
 
 

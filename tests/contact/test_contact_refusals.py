@@ -78,7 +78,7 @@ STEPS: dict[str, Callable[[], object]] = {
     "this Collider is not a .*Collider of the scene.*sim.scene.colliders": lambda: SIM(
         STATE, targets={pd.Collider(plane(1.0, 1.0, 1)): pose()}
     ),
-    r"step_: info must be float64 \[1, 12\] in a scene with Contact, got torch.float64 \[1, 7\]": lambda: SIM.step_(
+    r"step_: info must be float64 \[1, 13\] in a scene with Contact, got torch.float64 \[1, 7\]": lambda: SIM.step_(
         STATE.clone(), info=torch.zeros(1, 7, dtype=torch.float64)
     ),
     r"history.keys must be torch.int64 on cpu": lambda: SIM(with_history(keys=STATE.history.keys.float())),

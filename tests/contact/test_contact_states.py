@@ -102,7 +102,7 @@ def test_steps_in_place_and_rollouts() -> None:
     assert same(rest.state(), whole.state())
     assert same(half.state(), whole.state(4))
     assert whole.info.contact_gap.shape == whole.info.held_back.shape == whole.info.contact_overflow.shape == (9, 1)
-    kept, info = state.clone(), torch.zeros(1, 12, dtype=torch.float64)
+    kept, info = state.clone(), torch.zeros(1, 13, dtype=torch.float64)
     for step in range(9):
         sim.step_(kept, targets=targets(step), info=info)
     assert same(kept, whole.state())
@@ -214,6 +214,7 @@ def test_an_overflow_takes_the_step_back() -> None:
     assert sim.body_contact is not None
     assert int(info.contact_overflow[1]) > 0
     assert info.contact_overflow[[0, 2]].tolist() == [0, 0]
+    assert info.contact_gap.isnan().tolist() == [False, True, False]
     assert info.contact_pairs[1] == sim.body_contact.plan.capacity + info.contact_overflow[1]
     assert same(one_of(after, 1), one_of(state, 1))
     for environment in (0, 2):

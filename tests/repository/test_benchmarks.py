@@ -210,8 +210,8 @@ def test_body_contact_times_every_scene(tmp_path: Path, script: Callable[..., st
     out = tmp_path / "contact.json"
     script("benchmarks/body_contact.py", "--cells", "2", "--steps", "2", "--out", str(out))
     rows = json.loads(out.read_text())["rows"]
-    assert [row["scene"] for row in rows] == ["rest", "stack", "sheet", "apart"]
-    assert [row["triangles"] for row in rows] == [48 + 72, 96, 48 + 288, 96]
+    assert [row["scene"] for row in rows] == ["rest", "stack", "sheet", "apart", "octopus"]
+    assert [row["triangles"] for row in rows[:4]] == [48 + 72, 96, 48 + 288, 96]
     assert all(row["milliseconds"] > 0.0 < row["milliseconds_without"] for row in rows)
 
 
@@ -454,11 +454,22 @@ def test_a_cube_slides_or_rests_for_its_gradients() -> None:
 
 @pytest.mark.usefixtures("on_path")
 def test_nothing_crosses_in_the_first_scenes_of_the_soak() -> None:
-    """Of those, some have pairs; and a start that crosses would be found."""
+    """Of those, some have pairs; and a start that crosses would be found. Some thicknesses are refused."""
     soak = importlib.import_module("contact_soak")
-    rows = [soak.run_scene(number) for number in range(25)]
+    rows = [soak.run_scene(number) for number in range(30)]
     found = soak.summary(rows)
     assert found["faults"] == []
-    assert found["scenes"] == 25
-    assert found["nearer than the promise"] == found["overflows"] == 0
+    assert found["scenes"] == 30 - found["left out"] >= 25
+    assert found["nearer than the promise"] == found["overflows"] == found["scenes with frozen vertices"] == 0
     assert found["scenes with pairs"] > 10
+
+
+@pytest.mark.usefixtures("on_path")
+@pytest.mark.parametrize("number", [2, 11, 34, 65])
+def test_the_promise_holds_in_scenes(number: int) -> None:
+    """The first are a cube on another, on a needle, in a gripper, and a bar that is wrung."""
+    promise = importlib.import_module("contact_promise")
+    row = promise.run_scene(number)
+    assert row["fault"] is None
+    assert row["overflow"] == row["frozen"] == 0
+    assert 0.099 < row["gap"] < 2.0

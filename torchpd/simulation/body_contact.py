@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -25,7 +26,14 @@ from .state import ContactHistory, HistoryState, State, widened
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_MISSING, _PINS_HELD_BACK, _UNBALANCED, _PAIRS, _SHORTENED = 1, 2, 3, 4, 6  # columns in csrc/contact/views.h
+_MISSING, _PINS_HELD_BACK, _UNBALANCED, _PAIRS, _SHORTENED, _FROZEN = (
+    1,
+    2,
+    3,
+    4,
+    6,
+    7,
+)  # columns in csrc/contact/views.h
 _RESIDUAL = 0  # column of the rows of a step
 _CAPACITY = 2  # place among the sizes of the op
 _RIGID_NUMBERS = 13  # rigid_numbers in csrc/contact/views.h: filled in by steps, of scenes with such colliders alone
@@ -152,7 +160,7 @@ class BodyContact:
         plan: list[Tensor],
         settings: dict[str, Any],
     ) -> tuple[HistoryState, Tensor]:
-        """The next state, and rows [B, 12] for `Info.from_rows`.
+        """The next state, and rows [B, 13] for `Info.from_rows`.
 
         Args:
             state: a checked one, whose flow is in the material.
@@ -188,7 +196,8 @@ class BodyContact:
         positions, velocities, rows, numbers, held, actual, keys, pushes, _ = _ops.contact_step(
             state[0], state[1], forces, wanted, history, material, plan, arrays, **settings
         )
-        missing = (numbers[:, _MISSING] > 0)[:, None, None]
+        lacks = numbers[:, _MISSING : _MISSING + 1]
+        missing = (lacks > 0)[..., None]
         if rigid is not None:
             after = _ops.motion_after(history[0], goal, rates, masses, actual, rigid.numbers, time_step=time_step)
             motion = torch.where(missing, motion, after)
@@ -200,10 +209,12 @@ class BodyContact:
         held_back = numbers[:, _PINS_HELD_BACK:_UNBALANCED]
         if held.shape[1]:
             held_back = torch.cat([held_back, held.double()], dim=1).amax(dim=1, keepdim=True)
+        # lists that were cut know no distance
+        gap = torch.where(lacks > 0, math.nan, numbers[:, :_MISSING])
         # the residual of other scenes would count forces between bodies as unbalanced
-        unbalanced, gaps = numbers[:, _UNBALANCED : _UNBALANCED + 1], numbers[:, :_PINS_HELD_BACK]
-        found = numbers[:, _PAIRS:_SHORTENED]
-        rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gaps, held_back, found], dim=1)
+        unbalanced = numbers[:, _UNBALANCED : _UNBALANCED + 1]
+        found, frozen = numbers[:, _PAIRS:_SHORTENED], numbers[:, _FROZEN : _FROZEN + 1]
+        rows = torch.cat([unbalanced, rows[:, _RESIDUAL + 1 :], gap, lacks, held_back, found, frozen], dim=1)
         return HistoryState(positions, velocities, ContactHistory(actual, keys, pushes, motion, flow)), rows
 
     def surfaces(self, thickness: Tensor) -> ContactSurfaces:

@@ -231,7 +231,7 @@ class Notices:
             self._look_for_overlaps(scene, positions.detach())
 
     def after_contact(self, owner: object, positions: Tensor, rows: Tensor) -> None:
-        """Warn once of an environment whose step was taken back, by rows [B, 12]."""
+        """Warn once of an environment whose step was taken back, by rows [B, 13]."""
         scene = None if "capacity" in self._said else self._looked_at(owner, positions)
         if scene is None:
             return

@@ -255,7 +255,8 @@ class Info(NamedTuple):
         inverted: tetrahedra with det F <= 0 at the end of the step. A body may rest with some, converged, in a folded
             minimum of its energy. -1 unless requested.
         contact_gap: least distance of two surfaces of `Contact` over their thickness at the end of the step, among
-            pairs that are near each other; inf without any. 1 where surfaces rest, less where the solve is unfinished.
+            pairs that are near each other; inf without any, NaN where the step was taken back. 1 where surfaces rest,
+            less where the solve is unfinished.
         contact_overflow: pairs that `Contact.capacity` lacks. Where it is positive, positions, velocities and history
             stay as before the step. 0 without `Contact`.
         held_back: largest distance that a pinned vertex or a vertex of a `Collider` stays behind its target because
@@ -263,6 +264,8 @@ class Info(NamedTuple):
             would still move it. 0 without `Contact`.
         contact_pairs: most pairs near each other that a search of the step found, for `Contact.capacity`. 0 without.
         contact_searches: searches for pairs. 0 where nothing came near, and without `Contact`.
+        contact_frozen: vertices that an iteration left in place since no plane separates two surfaces beyond rounding,
+            summed over the iterations: no edge crosses, but they are late. 0 is usual.
     The residual is (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). Here r is the part of grad E [N] that
     neither pins nor contacts balance. f_i = a_i (u_i - s_i) is the force of inertia, weight and springs on vertex i,
     and e_i that of its elements. S x is the sum of stiffness times position (csrc/solver/report.h), so 4 eps |S x|
@@ -288,10 +291,11 @@ class Info(NamedTuple):
     held_back: Tensor = torch.tensor(0.0)
     contact_pairs: Tensor = torch.tensor(0)
     contact_searches: Tensor = torch.tensor(0)
+    contact_frozen: Tensor = torch.tensor(0)
 
     @classmethod
     def from_rows(cls, rows: Tensor) -> Info:
-        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 12]; older files have 6 or 10 columns."""
+        """Build it from float64 rows of a step [..., 7], with `Contact` [..., 13]; older files have 6 or 10 columns."""
         residual, energy, _, _, converged, rho, *counted = rows.unbind(-1)
         # one pass for all columns; what it makes of those that are no whole numbers is not read
         _, _, iterations, restarts, _, _, *whole = rows.long().unbind(-1)
@@ -299,8 +303,8 @@ class Info(NamedTuple):
         of_step = residual, energy, iterations, restarts, converged.bool(), rho, inverted
         none = torch.zeros_like(iterations)
         if len(counted) < 4:
-            return cls(*of_step, torch.full_like(rho, math.inf), none, torch.zeros_like(rho), none, none)
-        return cls(*of_step, counted[1], whole[2], counted[3], *(whole[4:] or (none, none)))
+            return cls(*of_step, torch.full_like(rho, math.inf), none, torch.zeros_like(rho), none, none, none)
+        return cls(*of_step, counted[1], whole[2], counted[3], *(whole[4:] or (none, none, none)))
 
     def __repr__(self) -> str:
         try:

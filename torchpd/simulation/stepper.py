@@ -23,7 +23,7 @@ from .state_checks import check_info, check_overwritten
 __all__ = ["Stepper"]
 
 _ops = torch.ops.torchpd
-_OF_CONTACT = 5  # columns of `Contact` in the rows of a report
+_OF_CONTACT = 6  # columns of `Contact` in the rows of a report
 
 
 class Stepper(Readable):
@@ -171,7 +171,7 @@ class Stepper(Readable):
         If an exception such as Ctrl-C ends it, each environment is either at the start or at the end of the step.
 
         Args:
-            info: rows [B, 7] float64 to fill in, with `Contact` [B, 12], see `Info.from_rows`; None leaves out
+            info: rows [B, 7] float64 to fill in, with `Contact` [B, 13], see `Info.from_rows`; None leaves out
                 residual, energy and inverted.
         """
         forces = self.check_state(state, forces=forces)
