@@ -310,11 +310,15 @@ def main() -> None:
     course = make(options.steps or usual)
     sim = course.sim
     state: Any = sim.rest_state() if course.state is None else course.state
-    begin, shown = time.perf_counter(), [state]
+    begin, shown, times, most = time.perf_counter(), [state], [], [0.0] * 3
     at = np.linspace(0, course.steps, options.frames).round().astype(int)[1:]
     for step in range(course.steps):
         given = None if course.targets is None else course.targets(step)
+        start = time.perf_counter()
         state, info = sim(state, targets=given, return_info=True)
+        times.append(1e3 * (time.perf_counter() - start))
+        found = (info.contact_pairs, info.contact_searches, 1e3 * info.held_back)
+        most = [max(value, float(new.max())) for value, new in zip(most, found, strict=True)]
         if step + 1 in at:
             shown.append(state)
     seconds = time.perf_counter() - begin
@@ -325,6 +329,10 @@ def main() -> None:
         f"{len(plan.edges)} edges, no crossing"
     )
     print(f"{course.steps} steps in {seconds:.1f} s; pairs with a force: {int((state.history.keys >= 0).sum())}")
+    print(
+        f"most of a step: {most[0]:,.0f} pairs near each other of a capacity of {plan.capacity:,}, {most[1]:.0f} "
+        f"searches, {most[2]:.2f} mm held back; {np.median(times):.1f} ms, most {max(times[1:], default=0.0):.1f} ms"
+    )
     print(
         f"least distance {float(info.contact_gap.min()):.2f} of the thickness; pairs that the capacity lacks: "
         f"{int(info.contact_overflow.max())}; held back by {1e3 * float(info.held_back.max()):.2f} mm"

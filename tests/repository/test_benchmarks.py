@@ -215,6 +215,20 @@ def test_body_contact_times_every_scene(tmp_path: Path, script: Callable[..., st
     assert all(row["milliseconds"] > 0.0 < row["milliseconds_without"] for row in rows)
 
 
+def test_contact_statics_measures_every_case(tmp_path: Path, script: Callable[..., str]) -> None:
+    out = tmp_path / "statics.json"
+    script("benchmarks/contact_statics.py", "--steps", "2", "--out", str(out))
+    rows = json.loads(out.read_text())["rows"]
+    assert {name: len(found) for name, found in rows.items()} == {
+        "stack": 2, "angle": 4, "stop": 8, "momentum": 5, "corner": 12, "gap": 4,
+    }  # fmt: skip
+    assert all(abs(row["relative error"]) < 0.02 for row in rows["stop"])
+    assert all(row["linear, change"] < 1e-12 and row["largest force [N]"] > 1.0 for row in rows["momentum"])
+    # friction turns bodies by the thickness
+    solved = [row["angular, balance of steps"] < 1e-12 for row in rows["momentum"]]
+    assert solved == [False, True, False, False, False]
+
+
 @pytest.fixture
 def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
     """The benchmarks are scripts, which find each other in their folder."""
