@@ -45,6 +45,7 @@ THICKNESS = 1e-3  # m
 ITERATIONS = (4, 16, 64, 256)
 OTHERS = (1, 2, 3, 5, 9, 33)  # iterations of steps that are taken beside
 MOST = 60  # steps of a course
+FLOOR = 0.099  # least distance over the thickness; the promise is 0.1, less its rounding in float32
 
 
 def turn(x: float, y: float, z: float) -> Array:
@@ -195,6 +196,8 @@ def run_scene(number: int) -> Row:
             after, info = sim(state, targets=targets, return_info=True)
         row["gap"] = min(row["gap"], float(info.contact_gap))
         row["overflow"] = max(row["overflow"], int(info.contact_overflow))
+        row["pairs"] = max(row["pairs"], int(info.contact_pairs))
+        row["frozen"] += int(info.contact_frozen)
         try:
             sim.check(after)
         except ValueError as error:
@@ -205,12 +208,12 @@ def run_scene(number: int) -> Row:
         given = {} if of.targets is None else of.targets(step)
         targets = {part: value.to(sim.rest_positions) for part, value in given.items()}
         if step % 4 == 0:
-            row["beside"] += sum(take(count) is not None for count in OTHERS)
+            for count in OTHERS:
+                take(count)
+            row["beside"] += len(OTHERS)
         state, info = take(iterations)
         row["steps"] += 1
-        row["pairs"] = max(row["pairs"], int(info.contact_pairs))
         row["searches"] += int(info.contact_searches)
-        row["frozen"] += int(info.contact_frozen)
         row["held_back"] = max(row["held_back"], float(info.held_back))
     return row | {"seconds": time.perf_counter() - begin}
 
@@ -228,10 +231,12 @@ def summary(rows: list[Row]) -> Row:
         "runs": len(rows),
         "steps": sum(row["steps"] + row["beside"] for row in rows),
         "faults": [{name: row[name] for name in ("scene", "fault")} for row in rows if row["fault"]],
+        "nearer than the promise": sum(row["gap"] < FLOOR for row in rows),
+        "least gap": min((row["gap"] for row in rows), default=np.inf),
         "overflows": sum(row["overflow"] > 0 for row in rows),
         "scenes": scenes,
     }
 
 
 if __name__ == "__main__":
-    judge_scenes(sys.argv[1:], str(__doc__), 8 * len(SCENES), run_scene, summary)
+    judge_scenes(sys.argv[1:], str(__doc__), 8 * len(SCENES), run_scene, summary, most=8 * len(SCENES))

@@ -166,12 +166,10 @@ def summary(rows: list[Row]) -> Row:
 def join(a: Row, b: Row) -> Row:
     """The summary of the scenes of two summaries: numbers and faults add up, but for the least gap.
 
-    Older ones did not count frozen vertices.
+    What one of them did not count is left out.
     """
-    return {
-        **{name: a.get(name, 0) + b.get(name, 0) for name in {**a, **b}},
-        "least gap": min(a["least gap"], b["least gap"]),
-    }
+    both = {name: a[name] + b[name] for name in a if name in b}
+    return {**both, "least gap": min(a["least gap"], b["least gap"])}
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def angle(steps: int | None) -> Iterator[Row]:
             speed, seconds = speed_on_slope(kind, youngs, ideal + offset, steps or 240)
             speeds[str(offset)] = speed
             rigid = seconds * G * math.sin(math.radians(offset)) / math.cos(math.radians(ideal))
-            if speed < 1e-5 and all(earlier < 1e-5 for earlier in speeds.values()):
+            if all(earlier < 1e-5 for earlier in speeds.values()):
                 rests = ideal + offset
             if speed > 0.5 * rigid > 0.0 and math.isnan(slides):
                 slides = ideal + offset
@@ -333,6 +333,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, help="of every case, at least 2; by default as many as it needs")
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()
+    if options.steps is not None and options.steps < 2:
+        parser.error(f"--steps must be at least 2, got {options.steps}")
     rows = {name: measure(name, options.steps) for name in options.cases}
     if options.out:
         write_result(options.out, {**describe_run(torch.device("cpu"), torch.get_num_threads()), "rows": rows})

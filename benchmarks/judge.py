@@ -26,7 +26,13 @@ Join = Callable[[Record, Record], Record]
 
 
 def judge_scenes(
-    words: list[str], about: str, scenes: int, judge: Judge, summary: Summary, join: Join | None = None
+    words: list[str],
+    about: str,
+    scenes: int,
+    judge: Judge,
+    summary: Summary,
+    join: Join | None = None,
+    most: int | None = None,
 ) -> None:
     """Run a benchmark of random scenes from the command line, a thread each; an interrupted one resumes.
 
@@ -37,6 +43,7 @@ def judge_scenes(
         judge: the row of a scene, by its number.
         summary: of rows, [] too.
         join: the summary of the scenes of two. With it, very many scenes can run in parts, of which no rows are kept.
+        most: how many there are; default: without end.
     """
     parser = argparse.ArgumentParser(description=about.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=scenes, help="number of random scenes (%(default)s)")
@@ -48,6 +55,8 @@ def judge_scenes(
         parser.add_argument("--summary", action="store_true", help="keep no rows, for very many scenes")
         parser.add_argument("--join", type=Path, nargs="+", help="files of --summary, joined in place of a run")
     options = parser.parse_args(words)
+    if most is not None:
+        options.scenes = min(options.scenes, most - options.first)
     if join is not None and options.join:
         kept = join_parts([json.loads(path.read_text()) for path in options.join], join)
     elif join is not None and options.summary:

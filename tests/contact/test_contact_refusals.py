@@ -72,7 +72,12 @@ STEPS: dict[str, Callable[[], object]] = {
     "targets of a Collider must be finite poses .* quaternion is not zero": lambda: SIM(
         STATE, targets={LEFT: torch.zeros(7, dtype=torch.float64)}
     ),
-    r"targets of a Collider must be finite poses .*got \[nan": lambda: SIM(STATE, targets={LEFT: pose(math.nan)}),
+    r"targets of a Collider must be finite poses .*got \[nan[^\]]*\]; \(1, 0": lambda: SIM(
+        STATE, targets={LEFT: pose(math.nan)}
+    ),
+    r"finite poses .*got \[nan.*\] in environment 1; \(1, 0": lambda: SIM(
+        SIM.rest_state(2), targets={LEFT: torch.stack([pose(), pose(math.nan)])}
+    ),
     r"targets of a Collider must be \[7\], .*got \[3\]": lambda: SIM(STATE, targets={LEFT: pose()[:3]}),
     "targets of a Collider must be torch.float64": lambda: SIM(STATE, targets={LEFT: pose().float()}),
     "this Collider is not a .*Collider of the scene.*sim.scene.colliders": lambda: SIM(

@@ -72,14 +72,15 @@ def test_of_each_environment() -> None:
         pd.ContactHistory(*(array.expand(3, *array.shape[1:]).clone() for array in state.history)),
     )
     for size in (1, 2):
-        friction = values[:, None, None].expand(3, size, size).clone().requires_grad_()
+        table = torch.ones(1, 1) if size == 1 else torch.tensor([[2.0, 1.0], [1.0, 3.0]])
+        friction = (values[:, None, None] * table.double()).requires_grad_()
         sim.contact_friction = friction
         together = way(sim, many, 4)
         assert together[0] > together[1] > together[2]
         (gradient,) = torch.autograd.grad(together.sum(), friction)
         for number in range(3):
             of_all = friction.detach()[number]
-            for shape in ([1, size, size], [size, size], [] if size == 1 else [size, size]):
+            for shape in ([1, size, size], [size, size], *([[]] if size == 1 else [])):
                 sim.contact_friction = own = of_all.reshape(shape).clone().requires_grad_()
                 alone = way(sim, state, 4)
                 assert torch.equal(alone[0], together[number])

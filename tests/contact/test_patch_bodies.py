@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import warnings
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from body_scenes import H
@@ -56,14 +58,18 @@ def test_a_ball_at_rest() -> None:
     assert float(state.positions[..., 1].min()) == pytest.approx(sim.body_contact.plan.thickness, rel=1e-2)
 
 
+def bumpy(height: float = 0.004) -> pd.PatchBody:
+    """A ball with a bump on its top."""
+    centre = torch.tensor([[0.5, 0.11, 0.0]])
+    quadric = pd.Quadrics.from_radii(torch.tensor([height]), centre, torch.tensor([0.03]))
+    return ball((0.5, 0.06, 0.0), quadric)
+
+
 def test_what_quadrics_add_is_said() -> None:
     """By its number, where it is more than the thickness; `rise` is the largest height of flat bases."""
-    mesh = pd.shapes.sphere(0.05)
-    centre = torch.tensor([[0.0, 0.11, 0.0]])
-    quadric = pd.Quadrics.from_radii(torch.tensor([0.004]), centre, torch.tensor([0.03]))
-    body = ball((0.0, 0.06, 0.0), quadric)
+    body = bumpy()
     grid = torch.tensor([[1.0, 1.0, 2.0], [2.0, 1.0, 1.0], [1.0, 2.0, 1.0]]) / 4.0
-    count = len(mesh.triangles)
+    count = len(body.patches.triangles)
     samples = body.patches.samples(torch.arange(count).repeat_interleave(3), grid.repeat(count, 1))
     heights = body.patches.heights(samples)[0].abs().max()
     assert 0.001 < float(heights) <= body.rise() + 1e-9 <= 0.005
@@ -73,3 +79,30 @@ def test_what_quadrics_add_is_said() -> None:
         warnings.simplefilter("error", pd.SceneWarning)
         pd.Simulator(pd.Scene(body, pd.Ground()), progress=False)
         pd.Simulator(pd.Scene(ball((0.0, 0.06, 0.0)), TABLE, pd.Contact()), progress=False)
+        pd.Simulator(pd.Scene(bumpy(0.0005), TABLE, pd.Contact()), progress=False)
+
+
+def test_their_triangles_are_those_of_the_patches() -> None:
+    """Gaps between the constraints of a skeleton, of which an octopus has many, are no surface."""
+    body = pd.PatchBody(pd.FreeFormPatches.from_mesh(pd.shapes.octopus(cells=16)), 1e5)
+    assert len(body.mesh.boundary()) > len(body.patches.triangles)
+    sim = pd.Simulator(pd.Scene(body, pd.Contact()), iterations=16, progress=False)
+    assert sim.body_contact is not None
+    assert np.array_equal(sim.body_contact.plan.triangles, body.patches.triangles.numpy())
+    sim.check(sim.rest_state())
+
+
+def test_one_that_takes_no_part() -> None:
+    """It passes through others, as `Contact(solid)` says, and nothing is said of its quadrics."""
+    solid, body = pd.Solid(pd.shapes.box((0.1,) * 3, (2,) * 3).translated((0.0, 0.1, 0.0)), 1e5), bumpy()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", pd.SceneWarning)
+        sim = pd.Simulator(pd.Scene(solid, body, TABLE, pd.Contact(solid, TABLE)), iterations=16, progress=False)
+    assert sim.body_contact is not None
+    assert len(sim.body_contact.plan.triangles) == len(solid.mesh.boundary()) + len(TABLE.mesh.boundary())
+
+
+def test_a_file_would_lose_the_patches(tmp_path: Path) -> None:
+    sim = pd.Simulator(pd.Scene(ball((0.0, 0.06, 0.0)), TABLE, pd.Contact()), iterations=16, progress=False)
+    with pytest.raises(ValueError, match=r"a PatchBody in a scene with Contact cannot be written.*patches.save"):
+        sim.save(tmp_path / "ball.safetensors")

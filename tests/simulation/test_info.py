@@ -370,3 +370,16 @@ def test_info_of_before_inversions_were_counted(dtype: torch.dtype, device: torc
     assert old.inverted.tolist() == [-1, -1, -1]
     with pytest.raises(ValueError, match=r"info .*got Double \[3, 6\]"):
         sim.step_(moving(sim), info=rows)
+
+
+def test_columns_of_contact() -> None:
+    """13 columns of a step with `Contact`; files of before lack the last three."""
+    rows = torch.arange(13.0, dtype=torch.float64)[None] + 0.25
+    info = pd.Info.from_rows(rows)
+    assert float(info.residual) == 0.25
+    assert [float(info.contact_gap), float(info.held_back)] == [7.25, 9.25]
+    assert [int(info.inverted), int(info.contact_overflow)] == [6, 8]
+    assert [int(info.contact_pairs), int(info.contact_searches), int(info.contact_frozen)] == [10, 11, 12]
+    old = pd.Info.from_rows(rows[:, :10])
+    assert all(torch.equal(one, other) for one, other in zip(old[:10], info[:10], strict=True))
+    assert [int(count) for count in old[10:]] == [0, 0, 0]

@@ -98,6 +98,11 @@ def save_simulation(saved: SavedSimulation, path: str | Path) -> None:
     """
     target = check_target_file(path)
     scene, settings = saved.scene, saved.settings
+    if scene.contact is not None and any(body.contact_triangles() is not None for body in scene.bodies):
+        raise ValueError(
+            "save: a PatchBody in a scene with Contact cannot be written, since the file keeps a Solid without its "
+            "patches; write them by patches.save, and make the scene again"
+        )
     meshes = _distinct_meshes(scene)
     tensors: dict[str, Tensor] = {}
     for number, mesh in enumerate(meshes):

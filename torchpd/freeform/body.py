@@ -31,7 +31,8 @@ class PatchBody(Solid):
     The energy of a constraint of four vertices is st v |G - R|^2, with G = Ds Dm^-1, R its nearest rotation and v its
     rest volume (Vyatkin and Dolgovesov 2023; st = w / 2 of `Solid`). The body's vertices are those of the patches, in
     their order, then the apexes. So pins, forces and targets of vertices 0..V-1 apply to the patches. Contacts act on
-    these vertices, and `Contact` on the triangles between them, not on the heights that quadrics add: see `rise`.
+    these vertices. `Contact` acts on the triangles of the patches, of prisms on the whole boundary of the layer, not on
+    the heights over them: see `rise`.
 
     "skeleton", for closed bodies: every patch has an apex inside. Patches that see an apex share it, and tetrahedra
     fill the space between, so that the constraints resist bending and change of volume.
@@ -112,8 +113,14 @@ class PatchBody(Solid):
         pose: PatchPose = self.transport(self.points(positions), fallback)
         return pose
 
+    def contact_triangles(self) -> Index | None:
+        """Those of the patches: constraints of a skeleton leave gaps, whose sides would count. A layer has none."""
+        if self.apex == "prism":
+            return None
+        return self.patches.triangles.cpu().numpy().astype(np.int64)
+
     def rise(self) -> float:
-        """How far the patches lie from their triangles, at most, by 15 points of each at rest [m]."""
+        """The largest distance of the patches from their triangles at 15 points of each, at rest [m]."""
         steps = torch.arange(5, dtype=self.patches.vertices.dtype, device=self.patches.vertices.device) / 4.0
         first, second = (line.reshape(-1) for line in torch.meshgrid(steps, steps, indexing="ij"))
         inside = first + second <= 1.0

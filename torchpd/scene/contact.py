@@ -231,7 +231,7 @@ def _check_member(name: str, body: object) -> None:
         fix = f"a coefficient of friction goes by name, Contact(friction={body})"
     else:
         fix = "pass them one by one"
-    raise TypeError(f"{name} takes Solid, Cloth, Rod and Collider, got {kind}; {fix}")
+    raise TypeError(f"{name} takes bodies and Collider, got {kind}; {fix}")
 
 
 def _capacity(value: Any) -> int | Literal["grow"] | None:
@@ -326,6 +326,9 @@ def contact_values(contact: Contact, bodies: Sequence[Body], colliders: Sequence
 
 
 def _triangles(part: Member) -> Index:
+    own = part.contact_triangles() if isinstance(part, Body) else None
+    if own is not None:
+        return own
     mesh = part.mesh
     if isinstance(mesh, Polyline):
         return np.zeros((0, 3), dtype=np.int64)

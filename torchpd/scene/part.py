@@ -98,8 +98,12 @@ class Body(KeyPart, ABC):
     def masses(self) -> Array:
         """Lumped masses of the vertices [V] kg."""
 
+    def contact_triangles(self) -> Index | None:
+        """Triangles [F, 3] that `Contact` takes; None: those of the mesh, or of its boundary."""
+        return None
+
     def rise(self) -> float:
-        """How far its surface lies from the triangles that contact acts on, at most [m]."""
+        """How far its surface was found to lie from the triangles that contact acts on [m]."""
         return 0.0
 
 

@@ -293,7 +293,7 @@ def _tables(friction: Tensor, bodies: int) -> Tensor:
     if friction.dim() > 0 and friction.shape[-1] > 1:
         friction = 0.5 * (friction + friction.mT)
     tables = friction.expand(*friction.shape[:-2], bodies, bodies)
-    # last, so that gradients of several steps add up in the order of any batch
+    # one environment is taken last: autograd then adds the gradients of steps as for any batch
     return (tables[0] if tables.dim() == 3 and len(tables) == 1 else tables).contiguous()
 
 

@@ -262,10 +262,11 @@ class Info(NamedTuple):
         held_back: largest distance that a pinned vertex or a vertex of a `Collider` stays behind its target because
             bodies are in the way [m]. Of a `Collider` with a mass, how far its inertia and the forces of its pairs
             would still move it. 0 without `Contact`.
-        contact_pairs: most pairs near each other that a search of the step found, for `Contact.capacity`. 0 without.
-        contact_searches: searches for pairs. 0 where nothing came near, and without `Contact`.
-        contact_frozen: vertices that an iteration left in place since no plane separates two surfaces beyond rounding,
-            summed over the iterations: no edge crosses, but they are late. 0 is usual.
+        contact_pairs: most pairs near each other that a search of the step found, for `Contact.capacity`. A step that
+            is taken back makes no further search, which might find more. 0 without `Contact`.
+        contact_searches: searches for pairs. 0 where the step without `Contact` was taken.
+        contact_frozen: free vertices that an iteration left in place since no plane separates two surfaces beyond
+            rounding, summed over the iterations: no edge crosses, but they are late. 0 is usual.
     The residual is (|r| - 4 eps |S x|)+ / max(|r|, sqrt(sum |f_i|^2 + |e_i|^2)). Here r is the part of grad E [N] that
     neither pins nor contacts balance. f_i = a_i (u_i - s_i) is the force of inertia, weight and springs on vertex i,
     and e_i that of its elements. S x is the sum of stiffness times position (csrc/solver/report.h), so 4 eps |S x|
@@ -301,10 +302,12 @@ class Info(NamedTuple):
         _, _, iterations, restarts, _, _, *whole = rows.long().unbind(-1)
         inverted = whole[0] if whole else torch.full_like(iterations, -1)
         of_step = residual, energy, iterations, restarts, converged.bool(), rho, inverted
-        none = torch.zeros_like(iterations)
-        if len(counted) < 4:
-            return cls(*of_step, torch.full_like(rho, math.inf), none, torch.zeros_like(rho), none, none, none)
-        return cls(*of_step, counted[1], whole[2], counted[3], *(whole[4:] or (none, none, none)))
+        if len(counted) >= 7:
+            return cls(*of_step, counted[1], whole[2], counted[3], *whole[4:])
+        none = torch.zeros_like(iterations)  # one operation for all counts
+        if len(counted) >= 4:
+            return cls(*of_step, counted[1], whole[2], counted[3], none, none, none)
+        return cls(*of_step, torch.full_like(rho, math.inf), none, torch.zeros_like(rho), none, none, none)
 
     def __repr__(self) -> str:
         try:
