@@ -105,7 +105,8 @@ def test_parts_of_a_soak_join_to_the_whole(tmp_path: Path) -> None:
         judged.append(number)
         gap = float("inf") if number == 3 else 0.1 + 0.01 * abs(number - 5)
         fault = "crosses" if number == 9 else None
-        return {"scene": number, "steps": number, "fault": fault, "gap": gap, "overflow": number % 2, "seconds": 0.5}
+        counts = {"steps": number, "overflow": number % 2, "frozen": number % 3}
+        return {"scene": number, "fault": fault, "gap": gap, "seconds": 0.5, **counts}
 
     def run(*words: object) -> dict[str, Any]:
         out = str(tmp_path / str(words[-1]))
@@ -121,6 +122,8 @@ def test_parts_of_a_soak_join_to_the_whole(tmp_path: Path) -> None:
     run("--summary", "--scenes", 8, "first.json")
     run("--summary", "--first", 8, "--scenes", 4, "second.json")
     assert judged == list(range(12))
+    judge_scenes(["--first", "10", "--scenes", "5"], "Parts.", 12, judge, summary, most=12)
+    assert judged[12:] == [10, 11]
     files = [tmp_path / "first.json", tmp_path / "second.json"]
     joined = run("--join", *files, "joined.json")
     assert joined["summary"] == whole["summary"]
