@@ -20,11 +20,13 @@ Measured ones are kept: an interrupted run resumes.
 
 from __future__ import annotations
 
+import runpy
 import sys
 import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -34,11 +36,11 @@ from scipy.spatial.transform import Rotation
 
 import torchpd as pd
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
-import contact_scenes as shown
+_EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "contact_scenes.py"
+shown = SimpleNamespace(**runpy.run_path(str(_EXAMPLE)))
 
 Array = np.ndarray
-Course = shown.Course
+Course = Any  # of examples/contact_scenes.py
 Row = dict[str, Any]
 H = 1 / 60  # s
 THICKNESS = 1e-3  # m
@@ -68,7 +70,7 @@ def course(
     state: Any = sim.rest_state()
     for axis, (body, speed) in velocities.items():
         state.velocities[:, sim.scene.vertex_range(body), "xyz".index(axis)] = speed
-    return Course(sim, MOST, targets, state)
+    return shown.Course(sim, MOST, targets, state)
 
 
 def cubes() -> Course:
@@ -140,7 +142,7 @@ def twisted(body: Any) -> Course:
         return {pin: torch.stack([start[:, 0], y * np.cos(angle) - side * z * np.sin(angle),
                                   side * y * np.sin(angle) + z * np.cos(angle)], dim=1)}  # fmt: skip
 
-    return Course(made.sim, MOST, targets, made.state)
+    return shown.Course(made.sim, MOST, targets, made.state)
 
 
 def bar() -> Course:

@@ -107,8 +107,6 @@ def test_a_step_equals_that_of_the_cpu(name: str, iterations: int) -> None:
         torch.testing.assert_close(own.history.poses.cpu(), state.history.poses, rtol=0.0, atol=1e-9)
         assert float(report.contact_gap) == pytest.approx(float(info.contact_gap), rel=1e-6)
         assert float(report.held_back) == pytest.approx(float(info.held_back), rel=1e-6, abs=1e-12)
-        assert int(report.contact_pairs) == int(info.contact_pairs)
-        assert int(report.contact_frozen) == int(info.contact_frozen)
         most = float(state.history.forces.abs().max())
         normal, theirs = (s.history.forces[..., 0].sum().item() for s in (own, state))
         assert normal == pytest.approx(theirs, rel=1e-6, abs=1e-6 * most)
