@@ -104,5 +104,8 @@ def test_one_that_takes_no_part() -> None:
 
 def test_a_file_would_lose_the_patches(tmp_path: Path) -> None:
     sim = pd.Simulator(pd.Scene(ball((0.0, 0.06, 0.0)), TABLE, pd.Contact()), iterations=16, progress=False)
-    with pytest.raises(ValueError, match=r"a PatchBody in a scene with Contact cannot be written.*patches.save"):
+    with pytest.raises(ValueError, match=r"a PatchBody that takes part in Contact cannot be written.*patches.save"):
         sim.save(tmp_path / "ball.safetensors")
+    solid = pd.Solid(pd.shapes.box((0.1,) * 3, (2,) * 3).translated((0.5, 0.1, 0.0)), 1e5)
+    apart = pd.Simulator(pd.Scene(ball((0.0, 0.06, 0.0)), solid, pd.Contact(solid)), iterations=16, progress=False)
+    apart.save(tmp_path / "ball.safetensors")

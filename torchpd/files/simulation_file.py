@@ -98,9 +98,10 @@ def save_simulation(saved: SavedSimulation, path: str | Path) -> None:
     """
     target = check_target_file(path)
     scene, settings = saved.scene, saved.settings
-    if scene.contact is not None and any(body.contact_triangles() is not None for body in scene.bodies):
+    met = [] if scene.contact is None else [body for body in scene.bodies if scene.contact.takes(body)]
+    if any(body.contact_triangles() is not None for body in met):
         raise ValueError(
-            "save: a PatchBody in a scene with Contact cannot be written, since the file keeps a Solid without its "
+            "save: a PatchBody that takes part in Contact cannot be written, since the file keeps a Solid without its "
             "patches; write them by patches.save, and make the scene again"
         )
     meshes = _distinct_meshes(scene)

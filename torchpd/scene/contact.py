@@ -185,6 +185,10 @@ class Contact(KeyPart):
         pairs = self.friction if isinstance(self.friction, Mapping) else {}
         return (*self.bodies, *selves, *(part for pair in pairs for part in pair))
 
+    def takes(self, part: Member) -> bool:
+        """Whether a body or collider of the scene takes part."""
+        return not self.bodies or any(part is one for one in self.bodies)
+
     def touches_itself(self, body: Member) -> bool:
         """Whether parts of a body meet each other."""
         if isinstance(self.self_contact, bool):
@@ -231,7 +235,7 @@ def _check_member(name: str, body: object) -> None:
         fix = f"a coefficient of friction goes by name, Contact(friction={body})"
     else:
         fix = "pass them one by one"
-    raise TypeError(f"{name} takes bodies and Collider, got {kind}; {fix}")
+    raise TypeError(f"{name} takes Solid, Cloth, Rod and Collider, got {kind}; {fix}")
 
 
 def _capacity(value: Any) -> int | Literal["grow"] | None:
@@ -303,7 +307,7 @@ class ContactValues:
 def contact_values(contact: Contact, bodies: Sequence[Body], colliders: Sequence[Collider]) -> ContactValues:
     """Arrays of contact between bodies of a scene and its colliders, all of them in the scene's order."""
     parts: tuple[Member, ...] = (*bodies, *colliders)
-    taking = [not contact.bodies or any(part is one for one in contact.bodies) for part in parts]
+    taking = [contact.takes(part) for part in parts]
     selves = [takes and contact.touches_itself(part) for takes, part in zip(taking, parts, strict=True)]
     counts = np.array([len(part.mesh.vertices) for part in parts])
     starts = np.cumsum(counts) - counts

@@ -26,14 +26,8 @@ from .state import ContactHistory, HistoryState, State, widened
 __all__ = ["BodyContact"]
 
 _ops = torch.ops.torchpd
-_MISSING, _PINS_HELD_BACK, _UNBALANCED, _PAIRS, _SHORTENED, _FROZEN = (
-    1,
-    2,
-    3,
-    4,
-    6,
-    7,
-)  # columns in csrc/contact/views.h
+# columns in csrc/contact/views.h
+_MISSING, _PINS_HELD_BACK, _UNBALANCED, _PAIRS, _SHORTENED, _FROZEN = 1, 2, 3, 4, 6, 7
 _RESIDUAL = 0  # column of the rows of a step
 _CAPACITY = 2  # place among the sizes of the op
 _RIGID_NUMBERS = 13  # rigid_numbers in csrc/contact/views.h: filled in by steps, of scenes with such colliders alone

@@ -155,8 +155,7 @@ def _may_pass(scene: Scene) -> bool:
 
 
 def _takes_part(scene: Scene, part: Member) -> bool:
-    contact = scene.contact
-    return contact is not None and (not contact.bodies or any(part is one for one in contact.bodies))
+    return scene.contact is not None and scene.contact.takes(part)
 
 
 class Notices:
