@@ -29,3 +29,9 @@ def script(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) 
         return capsys.readouterr().out
 
     return run
+
+
+@pytest.fixture
+def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The benchmarks are scripts, which find each other in their folder."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))

@@ -11,12 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from programs import ROOT
-
-
-@pytest.fixture
-def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
 
 
 @pytest.mark.usefixtures("on_path")
@@ -91,49 +85,6 @@ def test_scenes_that_were_judged_are_kept(tmp_path: Path, script: Callable[..., 
     out.write_text(json.dumps(first))
     main(["--scenes", "1", "--out", str(out)])
     assert json.loads(out.read_text())["rows"][0]["tuning_seconds"] == 123.0
-
-
-@pytest.mark.usefixtures("on_path")
-def test_parts_of_a_soak_join_to_the_whole(tmp_path: Path) -> None:
-    """A part that was stopped goes on where it was; scenes that two files hold are refused."""
-    from contact_soak import join, summary
-    from judge import judge_scenes
-
-    judged: list[int] = []
-
-    def judge(number: int) -> dict[str, Any]:
-        judged.append(number)
-        gap = float("inf") if number == 3 else 0.1 + 0.01 * abs(number - 5)
-        fault = "crosses" if number == 9 else None
-        counts = {"steps": number, "overflow": number % 2, "frozen": number % 3}
-        return {"scene": number, "fault": fault, "gap": gap, "seconds": 0.5, **counts}
-
-    def run(*words: object) -> dict[str, Any]:
-        out = str(tmp_path / str(words[-1]))
-        judge_scenes([*map(str, words[:-1]), "--out", out], "Parts.", 12, judge, summary, join)
-        found: dict[str, Any] = json.loads(Path(out).read_text())
-        return found
-
-    whole = run("whole.json")
-    assert [row["scene"] for row in whole["rows"]] == list(range(12))
-    judged.clear()
-    run("--summary", "--scenes", 4, "first.json")
-    assert run("--summary", "--seconds", 0.0, "--scenes", 7, "first.json")["parts"][1]["scenes"] == [[4, 5]]
-    run("--summary", "--scenes", 8, "first.json")
-    run("--summary", "--first", 8, "--scenes", 4, "second.json")
-    assert judged == list(range(12))
-    judge_scenes(["--first", "10", "--scenes", "5"], "Parts.", 12, judge, summary, most=12)
-    assert judged[12:] == [10, 11]
-    files = [tmp_path / "first.json", tmp_path / "second.json"]
-    joined = run("--join", *files, "joined.json")
-    assert joined["summary"] == whole["summary"]
-    assert joined["summary"]["faults"] == [{"scene": 9, "fault": "crosses"}]
-    assert [part["scenes"] for part in joined["parts"]] == [[[0, 4]], [[4, 5]], [[5, 8]], [[8, 12]]]
-    assert str(tmp_path) not in json.dumps(joined)
-    with pytest.raises(ValueError, match=r"different scenes, got \[\[0, 8\]\] twice"):
-        run("--join", *files, files[0], "again.json")
-    with pytest.raises(ValueError, match="one with rows"):
-        run("--join", tmp_path / "whole.json", "again.json")
 
 
 def _time_to_error_row(plain: int | None, levels: int | None, took: str) -> dict[str, Any]:

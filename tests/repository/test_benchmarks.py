@@ -206,35 +206,6 @@ def test_set_up_times_every_stage(tmp_path: Path, script: Callable[..., str]) ->
     assert all(stage["processor_seconds"] > 0.0 for stage in box["stages"].values())
 
 
-def test_body_contact_times_every_scene(tmp_path: Path, script: Callable[..., str]) -> None:
-    out = tmp_path / "contact.json"
-    script("benchmarks/body_contact.py", "--cells", "2", "--steps", "2", "--out", str(out))
-    rows = json.loads(out.read_text())["rows"]
-    assert [row["scene"] for row in rows] == ["rest", "stack", "sheet", "apart", "octopus"]
-    assert [row["triangles"] for row in rows[:4]] == [48 + 72, 96, 48 + 288, 96]
-    assert all(row["milliseconds"] > 0.0 < row["milliseconds_without"] for row in rows)
-
-
-def test_contact_statics_measures_every_case(tmp_path: Path, script: Callable[..., str]) -> None:
-    out = tmp_path / "statics.json"
-    script("benchmarks/contact_statics.py", "--steps", "2", "--out", str(out))
-    rows = json.loads(out.read_text())["rows"]
-    assert {name: len(found) for name, found in rows.items()} == {
-        "stack": 2, "angle": 4, "stop": 8, "momentum": 5, "corner": 12, "gap": 4,
-    }  # fmt: skip
-    assert all(abs(row["relative error"]) < 0.02 for row in rows["stop"])
-    assert all(row["linear, change"] < 1e-12 and row["largest force [N]"] > 1.0 for row in rows["momentum"])
-    # friction turns bodies by the thickness
-    solved = [row["angular, balance of steps"] < 1e-12 for row in rows["momentum"]]
-    assert solved == [False, True, False, False, False]
-
-
-@pytest.fixture
-def on_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The benchmarks are scripts, which find each other in their folder."""
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-
-
 @pytest.mark.usefixtures("on_path")
 def test_scenes_of_the_gpu_are_what_their_names_say() -> None:
     scenes = importlib.import_module("gpu_scenes")
@@ -464,26 +435,3 @@ def test_a_cube_slides_or_rests_for_its_gradients() -> None:
     assert rows[1]["slide"] == 0.0
     # which of the two takes longer depends on other programs
     assert all(row["vertices"] == 27 and min(row["forward"], row["both"]) > 0.0 for row in rows)
-
-
-@pytest.mark.usefixtures("on_path")
-def test_nothing_crosses_in_the_first_scenes_of_the_soak() -> None:
-    """Of those, some have pairs; and a start that crosses would be found. Some thicknesses are refused."""
-    soak = importlib.import_module("contact_soak")
-    rows = [soak.run_scene(number) for number in range(30)]
-    found = soak.summary(rows)
-    assert found["faults"] == []
-    assert found["scenes"] == 30 - found["left out"] >= 25
-    assert found["nearer than the promise"] == found["overflows"] == found["scenes with frozen vertices"] == 0
-    assert found["scenes with pairs"] > 10
-
-
-@pytest.mark.usefixtures("on_path")
-@pytest.mark.parametrize("number", [2, 11, 34, 65])
-def test_the_promise_holds_in_scenes(number: int) -> None:
-    """The first are a cube on another, on a needle, in a gripper, and a bar that is wrung."""
-    promise = importlib.import_module("contact_promise")
-    row = promise.run_scene(number)
-    assert row["fault"] is None
-    assert row["overflow"] == row["frozen"] == 0
-    assert 0.099 < row["gap"] < 2.0
